@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from qrlsuite import api as api
+    from qrlsuite.api import agent as agent
     from qrlsuite.api import board as board
     from qrlsuite.api import compare as compare
     from qrlsuite.api import diagnose as diagnose
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "Circuit", "__version__", "api", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "hookimpl",
+    "Circuit", "__version__", "agent", "api", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "hookimpl",
     "import_curves", "layer", "load", "new_study", "play", "plot", "read_study", "register", "register_environments",
     "run_study", "table", "train", "tune",
 ]  # fmt: skip

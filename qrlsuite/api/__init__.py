@@ -12,6 +12,7 @@
     api.diagnose("mlp width=16")
     api.diagnose_ansatz("iqp", qubits="4:12")
     api.play("mlp width=16").save("episode.gif")
+    api.agent("mlp width=16").act(observations)
     api.run_study("width.toml")
 
 Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
@@ -30,14 +31,14 @@ if TYPE_CHECKING:
     from qrlsuite.api.entries import board, compare, load, plot
     from qrlsuite.api.external import import_curves
     from qrlsuite.api.own import register
-    from qrlsuite.api.playing import play
+    from qrlsuite.api.playing import agent, play
     from qrlsuite.api.studies import new_study, read_study, run_study
     from qrlsuite.api.tables import table
     from qrlsuite.api.training import evaluate, train, tune
 
 __all__ = [
-    "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "import_curves", "load", "new_study", "play", "plot",
-    "read_study", "register", "run_study", "table", "train", "tune",
+    "agent", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "import_curves", "load", "new_study",
+    "play", "plot", "read_study", "register", "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _MODULES = {
@@ -45,7 +46,7 @@ _MODULES = {
     "entries": ("board", "compare", "load", "plot"),
     "external": ("import_curves",),
     "own": ("register",),
-    "playing": ("play",),
+    "playing": ("agent", "play"),
     "studies": ("new_study", "read_study", "run_study"),
     "tables": ("table",),
     "training": ("evaluate", "train", "tune"),

@@ -23,7 +23,7 @@ from PIL import Image
 from rich.text import Text
 
 import qrlsuite
-from qrlsuite.api.evaluation import find, the_task
+from qrlsuite.api.trained import load
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry
@@ -169,21 +169,18 @@ def record(
     published: bool = False,
 ) -> Episode:
     """Play an episode with an entry's best trained agent, and draw it: see `qrlsuite.api.play`."""
-    on = None if task is None else the_task(runs, task, published)
-    store = find(runs, entry, None if on is None else on.name, published)
-    played = evaluation.trained_entry(store, on)
+    agent = load(runs, entry, task, None, published)
+    played = agent.entry
     drawn = _Drawn(played)  # before anything is played
-    seeds, _, count = evaluation.best_runs(store, 1)
-    agents = evaluation.trained_agents(played, store, seeds)
     streams = Streams(played.task.hash, seed)
     envs = build_envs(played, 1, lambda: None)
     envs.inner.autoreset = False
     envs.seed_lanes([streams.numpy("evaluation", number)])
     actions: list[NDArray[Any]] = []
 
-    @functools.wraps(agents.act)
+    @functools.wraps(agent.trainer.act)
     def act(*seen: Any) -> NDArray[Any]:
-        chosen = agents.act(*seen)
+        chosen = agent.trainer.act(*seen)
         actions.append(np.array(chosen[0]))
         return chosen
 
@@ -197,9 +194,9 @@ def record(
             f"which its lanes earn {ended.returns[0]:g}, so it cannot be drawn: `qrlsuite check` says where they differ"
         )
     return Episode(
-        evaluation.policy_name(store, on),
-        seeds[0],
-        count,
+        agent.policy,
+        agent.seed,
+        agent.runs,
         played.task.name,
         number,
         np.stack(actions),

@@ -1,4 +1,4 @@
-"""How a trained agent plays, seen."""
+"""Trained agents: as a policy, and how one plays, seen."""
 
 from __future__ import annotations
 
@@ -10,6 +10,53 @@ from qrlsuite.errors import OptionError
 
 if TYPE_CHECKING:
     from qrlsuite.api.episode import Episode
+    from qrlsuite.api.trained import TrainedAgent
+
+
+def agent(
+    entry: str,
+    *,
+    task: str | None = None,
+    seed: int | None = None,
+    published: bool = False,
+    runs: str | PathLike[str] = "runs",
+) -> TrainedAgent:
+    """Return a trained agent of an entry, to act in a loop of your own.
+
+    Parameters
+    ----------
+    entry:
+        Its name, label, the beginning of one of them, or folder.
+    task:
+        The task that it plays, as for `evaluate`; None is the entry's own.
+    seed:
+        Of the agent; None takes the one with the highest last validation score.
+    published:
+        Look among the published entries that come with the suite, too.
+    runs:
+        The results folder.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry, or several, have the name.
+    OptionError
+        If the agent cannot play the task.
+    StoreError
+        If the entry has no trained agent, or none of the seed.
+
+    Examples
+    --------
+    >>> policy = agent("vqc-native qubits=6", task="beam6g", published=True)  # doctest: +SKIP
+    >>> lanes = policy.environments(4)  # doctest: +SKIP
+    >>> observations, infos = lanes.reset(seed=1)  # doctest: +SKIP
+    >>> lanes.step(policy.act(observations))  # doctest: +SKIP
+    """
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+        raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
+    from qrlsuite.api import trained  # torch, which all other functions do without
+
+    return trained.load(Path(runs), entry, task, seed, published)
 
 
 def play(

@@ -19,6 +19,7 @@ from qrlsuite.api import episode as episodes
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
 from qrlsuite.plugins.environments.beam6g.env import BeamManagement6G
 from qrlsuite.results.store import EntryStore
+from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
 from tests.commands import say
 from tests.conftest import Train, trainer
@@ -107,6 +108,41 @@ def test_the_episode_is_the_one_that_evaluate_plays(train: Train, tmp_path: Path
         assert apart.mean() < 8, "256 colors for all frames"
         assert np.abs(shown.frames[number].astype(int) - shown.frames[number - 1]).max() > 50
     assert 'src="data:image/gif;base64,R0lGOD' in shown._repr_html_()
+
+
+def test_an_agent_acts_in_a_loop_of_ones_own(train: Train, tmp_path: Path) -> None:
+    store = EntryStore(train("runs", [0, 1, 2], 2))
+    shown = api.play(str(store.path), episode=3, runs=tmp_path / "runs")
+    agent = api.agent(str(store.path), runs=tmp_path / "runs")
+    assert (agent.seed, agent.runs, agent.task) == (shown.seed, 3, "tiny")
+    lanes = agent.environments()
+    lanes.autoreset = False
+    lanes.seed_lanes([Streams(agent.entry.task.hash, 0).numpy("evaluation", 3)])
+    observations, _ = lanes.reset()
+    for action, reward in zip(shown.actions, shown.rewards):
+        chosen = agent.act(observations)
+        assert np.array_equal(chosen, action[None])
+        observations, rewards, *_ = lanes.step(chosen)
+        assert rewards == pytest.approx(reward, rel=1e-5)
+    other = api.agent(str(store.path), seed=1, runs=tmp_path / "runs")
+    assert (other.seed, other.runs) == (1, 1)
+    assert other.environments(3).reset(seed=0)[0].shape == (3, observations.shape[1])
+    with pytest.raises(
+        OptionError, match=r"observations of shape \(2, 5\): task 'tiny' has 3 .* one alone is \(1, 3\)"
+    ):
+        agent.act(np.zeros((2, 5)))
+    for bad, message in ((7, "has no seed 7"), (True, "seed = True: give a whole number")):
+        with pytest.raises(QrlSuiteError, match=message):
+            api.agent(str(store.path), seed=bad, runs=tmp_path / "runs")
+
+
+def test_an_agent_that_remembers_is_told_where_episodes_begin(train: Train, tmp_path: Path) -> None:
+    store = EntryStore(train("runs", [0], 1, "ppo gru", ("width=2",)))
+    agent = api.agent(str(store.path), runs=tmp_path / "runs")
+    observations, infos = agent.environments(2).reset(seed=0)
+    with pytest.raises(OptionError, match=r"'ppo' remembers episodes: give act\(\) where they begin"):
+        agent.act(observations)
+    assert agent.act(observations, np.ones(2, bool), infos).shape == (2,)
 
 
 def test_any_environment_that_draws_frames(tmp_path: Path) -> None:
