@@ -55,6 +55,11 @@ class GateOptions:
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class NoOptions:
+    """An ansatz without options."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class EntangledOptions:
     """Options of `jerbi` and `skolik`."""
 
