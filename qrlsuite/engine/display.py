@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColum
 from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import again, command, printable
 from qrlsuite.engine.work import Missing
+from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.survey import GroupStatus
 from qrlsuite.results.text import counted, duration
@@ -437,6 +438,12 @@ class RunDisplay:
         if summary["seeds"] < protocol_seeds:
             self.console.print(f"provisional: the task's protocol asks for {protocol_seeds} seeds")
         self.console.print(f"results: {self.missing.store.path}", markup=False, soft_wrap=True)
+        if min(self.missing.seeds) >= TUNING_SEEDS:
+            self.console.print(
+                f"seeds from {TUNING_SEEDS:,} up are for trying settings: boards and pictures leave them out",
+                soft_wrap=True,
+            )
+            return
         name = self.entry.task.name
         for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
             self.console.print(

@@ -42,6 +42,14 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
         assert (f"results go to the new folder {runs};" in done.stderr) == (width == "16")
     words = ("run", "ddqn", "mlp", "width=16", "--task", task, "--runs", runs)
     assert json.loads(qrlsuite(*words, "--json").stdout)["seeds"] == 4
+    assert "next: qrlsuite leaderboard --task tiny" in done.stderr
+    tried = qrlsuite(
+        "run", "ddqn", "mlp", "width=4", "--task", task, "--runs", runs, "--seeds", "1000000:1000001"
+    )
+    assert (
+        "seeds from 1,000,000 up are for trying settings: boards and pictures leave them out" in tried.stderr
+    )
+    assert "next:" not in tried.stderr
 
     assert "undecided: fewer than 20 seeds" in qrlsuite("leaderboard", "--runs", runs).stdout
     (section,) = json.loads(say("leaderboard", "--runs", runs, "--format", "json").stdout)["sections"]
