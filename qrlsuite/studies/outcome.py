@@ -29,6 +29,9 @@ from qrlsuite.studies.study import load_kept
 Pair = TypeVar("Pair")
 """What is known of a pair: its decision, or more."""
 
+NEAR = 0.9
+"""Share of the horizon that entries spend below thresholds, beyond which they can hardly be told apart."""
+
 Hours = tuple[float, float]
 """Least and most core-hours to be expected; both the same where they were measured on the entry's own seeds."""
 
@@ -213,6 +216,8 @@ class StudyOutcome(Shown):
                 f"steps {study.grid.before} threshold: of a run of the entry, mean over seeds and thresholds, at its "
                 "last look"
             )
+        if note := self._capped(facts["entries"]):
+            yield Text(note)
         if state.begun_at:
             yield Text(f"hash {study.hash}, first seed begun {state.begun_at}")
         for seeds, when in facts["looks_taken"].items():
@@ -220,6 +225,20 @@ class StudyOutcome(Shown):
         if note := reason_note(study):
             yield Text(note)
         yield from map(Text, self._cost(facts))
+
+    def _capped(self, entries: Sequence[Mapping[str, Any]]) -> str:
+        """Name the pairs of which both hardly leave the horizon, so that a verdict says little; empty without any."""
+        first = next(iter(self.study.entries.values()))
+        steps = self.study.epochs * first.task.file.protocol.interactions
+        late = {each["name"] for each in entries if (each["mean_time"] or 0) >= NEAR * steps}
+        pairs = [versus(pair) for pair in self.pairs if pair.p and {pair.first, pair.second} <= late]
+        if not pairs:
+            return ""
+        return (
+            f"both entries are {self.study.grid.before} the thresholds for {NEAR:.0%} or more of the "
+            f"{steps_text(steps)} steps, so the verdict, above all that they are equal, says little: "
+            f"{'; '.join(pairs)}. Give a study of them more epochs"
+        )
 
     def _design(self) -> Iterator[str]:
         """Say what is fixed when the first seed is trained."""

@@ -698,6 +698,20 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks()
     assert shown.count("10 qubits / width 14") == 1
 
 
+def test_pairs_that_hardly_leave_the_horizon_are_named() -> None:
+    """By the published study, of which most pairs are equal because nothing learns in time."""
+    outcome = api.read_study("dissecting")
+    late = {name for name, time in outcome.mean_times().items() if time.mean >= 90_000}
+    expected = [
+        f"{pair.first} / {pair.second}" for pair in outcome.pairs if {pair.first, pair.second} <= late
+    ]
+    assert 0 < len(expected) < len(outcome.pairs)
+    shown = " ".join(say("show", "dissecting").stdout.split())
+    assert "both entries are below the thresholds for 90% or more of the 100k steps" in shown
+    assert f"says little: {'; '.join(expected)}. Give a study of them more epochs" in shown
+    assert "both entries are" not in say("show", "quantum-or-not").stdout
+
+
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:
     write()
     for names, said in (
