@@ -66,7 +66,7 @@ def verdicts(outcome: StudyOutcome) -> Rows:
         yield f"**{question}**", "", "", "", ""
         for pair in pairs:
             seeds = str(pair.n_runs) if pair.n_runs else ""
-            yield versus(pair), pair.verdict, seeds, *difference_text(pair, outcome.study.grid)
+            yield versus(pair), outcome.verdict(pair), seeds, *difference_text(pair, outcome.study.grid)
 
 
 def entries(outcome: StudyOutcome) -> Rows:

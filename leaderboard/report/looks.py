@@ -96,7 +96,7 @@ def view(outcome: StudyOutcome) -> StudyView:
             color=index,
             question=clean(facts["question"] or "", 300),
             pair=clean(versus(pair)),
-            verdict=clean(pair.verdict),
+            verdict=clean(outcome.verdict(pair)),
             seeds=pair.n_runs,
             difference=difference_text(pair, study.grid)[0].replace("-", "−"),
             interval=difference_text(pair, study.grid)[1].replace("-", "−"),

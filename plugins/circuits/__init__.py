@@ -27,7 +27,7 @@ def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
         (
             "skolik",
             "Re-uploading with trainable input scaling: RX, RY, RZ and a ring of CZs; option: entangled",
-            "EntangledOptions",
+            "SkolikOptions",
         ),
         (
             "jerbi",

@@ -61,9 +61,16 @@ class NoOptions:
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class EntangledOptions:
-    """Options of `jerbi` and `skolik`."""
+    """Options of `jerbi`."""
 
     entangled: Entangled = True
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SkolikOptions:
+    """Options of `skolik`."""
+
+    entangled: Annotated[Entangled, Since("0.2.0")] = True
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -148,7 +155,7 @@ def cz(qubits: int, layers: int, options: GateOptions) -> Circuit:
     return _reuploading(qubits, layers, options, lambda circuit: _ring(circuit, "CZ"), controlled=False)
 
 
-def skolik(qubits: int, layers: int, options: EntangledOptions) -> Circuit:
+def skolik(qubits: int, layers: int, options: SkolikOptions) -> Circuit:
     """Build the data re-uploading circuit for Q-learning of Skolik, Jerbi & Dunjko (Quantum 6, 720, 2022).
 
     Every layer: RX(scaling[l, q] * input[q]), then RY(weights[l, q, 0]) and RZ(weights[l, q, 1]) on every qubit,

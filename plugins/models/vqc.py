@@ -54,7 +54,7 @@ NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
 
 Activation = Literal["none", "relu", "tanh"]
 Readout = Literal["ansatz", "single", "pairs", "neighbors", "all-pairs", "product"]
-Linear = bool | Literal["behind"]
+Linear = Literal[True, False, "behind"]
 OptionValue = bool | int | float | str
 
 
@@ -531,8 +531,8 @@ def _require_fit(runner: _Runner, inputs: int, outputs: int, role: str) -> None:
     shown = linear == "behind" or values >= outputs
     if enough and shown:
         return
-    advice = "choose qubits, or options of the ansatz, so that inputs are as many" + (
-        "" if linear else ", and expectation values no fewer"
+    advice = f"choose qubits, or options of the ansatz, so that inputs are {inputs}" + (
+        "" if linear else f", and expectation values {outputs} or more"
     )
     if circuit.inputs > inputs and shown:
         advice = "choose fewer qubits, or set input_reuse=true, and observations are given several times"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -60,26 +61,63 @@ class TrainedAgent:
         Parameters
         ----------
         begins:
-            Where an episode begins with the observation, (B,); only an agent that remembers needs it.
+            Where an episode begins with the observation (B,): everywhere after a reset, then `terminated | truncated`.
+            Only an agent that remembers needs it.
         infos:
-            What the environments said of it; only an agent of a task with masks needs it.
+            What the environments said of it. Only a task with masks needs it: `infos["action_mask"]` (B, choices).
 
         Raises
         ------
         OptionError
-            If observations have another size, or an agent that remembers is not told where episodes begin.
+            If an argument has another shape or values that are not finite, or is needed and absent.
         """
-        size = int(np.prod(self.trainer.envs.single_observation_space.shape or (1,)))
-        seen = np.asarray(observations, np.float32)
-        if seen.ndim < 1 or not len(seen) or seen.size != len(seen) * size:
+        seen = self._seen(observations)
+        mask = np.asarray((infos or {}).get("action_mask"))
+        if self._masked and mask.shape[:1] != (len(seen),):
             raise OptionError(
-                f"observations of shape {np.shape(observations)}: task '{self.task}' has {size} numbers each, so give "
-                f"(B, {size}); one alone is (1, {size})"
+                f"task '{self.task}' says what can be chosen: give act() the infos of the environments, whose "
+                f"'action_mask' has {len(seen)} rows here"
             )
         try:
-            return self.trainer.act(seen, begins, infos)
+            return self.trainer.act(seen, None if begins is None else _begins(begins, len(seen)), infos)
         except ValueError as error:
             raise OptionError(str(error)) from None
+
+    @cached_property
+    def _masked(self) -> bool:
+        return "action_mask" in self.environments().reset(seed=0)[1]
+
+    def _seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+        envs = self.trainer.envs
+        size = int(np.prod(envs.single_observation_space.shape or (1,)))
+        whole = getattr(envs.unflattened_space, "shape", None)
+        said = f"task '{self.task}' has {size} numbers each, so give (B, {size}); one alone is (1, {size})"
+        try:
+            given = np.asarray(observations)
+        except (
+            TypeError,
+            ValueError,
+            RuntimeError,
+        ):  # rows of unequal length, or a tensor that needs its gradient
+            given = np.empty(0, object)
+        if given.dtype.kind not in "biuf":
+            raise OptionError(
+                f"observations of type {type(observations).__name__} are no array of real numbers: {said}"
+            )
+        with np.errstate(over="ignore"):
+            seen = given.astype(np.float32)
+        if seen.ndim == 0 or len(seen) == 0 or seen.shape[1:] not in ((size,), whole):
+            raise OptionError(f"observations of shape {seen.shape}: {said}")
+        if not np.isfinite(seen).all():
+            raise OptionError("observations are not finite: the agent has seen none like these")
+        return seen
+
+
+def _begins(given: Any, lanes: int) -> NDArray[np.bool_]:
+    begins = np.asarray(given)
+    if begins.shape != (lanes,) or begins.dtype.kind not in "biuf" or not np.isin(begins, (0, 1)).all():
+        raise OptionError(f"begins: give {lanes} truth values, one for each observation")
+    return begins.astype(np.bool_)
 
 
 def load(

@@ -439,20 +439,25 @@ def new(
     while first_seed is None and study.trained_before():
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
-    names = _brief(list(study.entries))
-    if names != list(study.entries):
+    names, shared = _brief(list(study.entries))
+    if shared:
         tables = [table.model_copy(update={"name": name}) for table, name in zip(study.file.entries, names)]
         study = StudyWithLooks(Study(study.file.model_copy(update={"entries": tables}), "the study"), runs)
-    study.file = study.file.model_copy(update={"summary": question_of(list(study.entries))})
+    summary = question_of(names) + (f" All have {' '.join(shared)}." if shared else "")
+    study.file = study.file.model_copy(update={"summary": summary})
     return study
 
 
-def _brief(names: Sequence[str]) -> list[str]:
-    """Return names without the options that all of them have, where one is too long for a table's line."""
+def _brief(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return names without the options that all have, where one is too long for a table's line; and these options."""
     words = [notation.split(name) for name in names]
-    shared = set.intersection(*map(set, words)) if max(map(len, names)) > LONG else set()
-    brief = [" ".join(w for i, w in enumerate(each) if i == 0 or w not in shared) for each in words]
-    return brief if len(set(brief)) == len(brief) else list(names)
+    shared = [
+        word
+        for word in words[0]
+        if "=" in word and all(word in each for each in words) and max(map(len, names)) > LONG
+    ]
+    brief = [" ".join(word for word in each if word not in shared) for each in words]
+    return (brief, shared) if len(set(brief)) == len(brief) else (list(names), [])
 
 
 def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -178,6 +179,7 @@ class StudyOutcome(Shown):
             "first": pair.first,
             "second": pair.second,
             "verdict": pair.verdict,
+            "at_horizon": self.late(pair),
             "decided": None if pair.decided is None else str(pair.decided),
             "seeds": pair.n_runs,
             "p": list(pair.p),
@@ -216,8 +218,12 @@ class StudyOutcome(Shown):
                 f"steps {study.grid.before} threshold: of a run of the entry, mean over seeds and thresholds, at its "
                 "last look"
             )
-        if note := self._capped(facts["entries"]):
-            yield Text(note)
+        if any(map(self.late, self.pairs)):
+            yield Text(
+                f"at the horizon: both entries are {study.grid.before} the thresholds for {NEAR:.0%} or more of the "
+                "steps. That they are equal, or not told apart, says little there: neither had the time to learn. "
+                "Plan a new study with more epochs"
+            )
         if state.begun_at:
             yield Text(f"hash {study.hash}, first seed begun {state.begun_at}")
         for seeds, when in facts["looks_taken"].items():
@@ -226,19 +232,20 @@ class StudyOutcome(Shown):
             yield Text(note)
         yield from map(Text, self._cost(facts))
 
-    def _capped(self, entries: Sequence[Mapping[str, Any]]) -> str:
-        """Name the pairs of which both hardly leave the horizon, so that a verdict says little; empty without any."""
+    def late(self, pair: PairDecision) -> bool:
+        """Tell whether a pair is not known to differ, and cannot be: both entries hardly leave the horizon."""
+        differs = pair.decided in (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF)
+        return not differs and {pair.first, pair.second} <= self._late
+
+    @functools.cached_property
+    def _late(self) -> set[str]:
         first = next(iter(self.study.entries.values()))
-        steps = self.study.epochs * first.task.file.protocol.interactions
-        late = {each["name"] for each in entries if (each["mean_time"] or 0) >= NEAR * steps}
-        pairs = [versus(pair) for pair in self.pairs if pair.p and {pair.first, pair.second} <= late]
-        if not pairs:
-            return ""
-        return (
-            f"both entries are {self.study.grid.before} the thresholds for {NEAR:.0%} or more of the "
-            f"{steps_text(steps)} steps, so the verdict, above all that they are equal, says little: "
-            f"{'; '.join(pairs)}. Give a study of them more epochs"
-        )
+        horizon = self.study.epochs * first.task.file.protocol.interactions
+        return {name for name, time in self.mean_times().items() if time.mean >= NEAR * horizon}
+
+    def verdict(self, pair: PairDecision) -> str:
+        """Return a pair's verdict, and whether there was no time for another one."""
+        return f"{pair.verdict}, at the horizon" if self.late(pair) else pair.verdict
 
     def _design(self) -> Iterator[str]:
         """Say what is fixed when the first seed is trained."""
@@ -386,7 +393,7 @@ def _sheet(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[st
     rows = [
         (
             versus(pair),
-            pair.verdict,
+            outcome.verdict(pair),
             str(pair.n_runs),
             *difference_text(pair, outcome.study.grid),
             f"{pair.p[-1]:.2g}" if pair.p else "",

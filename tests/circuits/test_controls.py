@@ -167,6 +167,12 @@ def test_coupled_circuits_keep_their_identity() -> None:
         return resolve("beam6g", "vqc-native", settings=[parse_setting(f"entangled={value}")]).hash
 
     assert hash_with("true") == plain.hash
+    for name in ("skolik", "iqp", "cz"):
+        words = [parse_setting(f"ansatz={name}"), parse_setting("entangled=true")]
+        assert (
+            resolve("beam6g", "vqc-native", settings=words[:1]).hash
+            == resolve("beam6g", "vqc-native", settings=words).hash
+        )
     assert len({plain.hash, hash_with("separable"), hash_with("mean-field")}) == 3
 
 

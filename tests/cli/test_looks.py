@@ -355,9 +355,13 @@ def test_names_of_a_new_study_leave_out_what_all_entries_share() -> None:
         "mlp width=3 batch=32 target_steps=100",
         "mlp width=16",
     ]
+    shown = say("show", study).stdout
+    assert "Which of 5 entries needs the fewest steps? All have gamma=0.9 lr=0.002." in " ".join(
+        shown.split()
+    )
     text = Path(study).read_text()
     assert 'name = "mlp width=8 batch=32 target_steps=100"' in text
-    assert 'summary = "Which of 5 entries needs the fewest steps?"' in text
+    assert 'summary = "Which of 5 entries needs the fewest steps? All have gamma=0.9 lr=0.002."' in text
     assert found["hash"] == answer("show", study)["hash"]
 
 
@@ -698,18 +702,28 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks()
     assert shown.count("10 qubits / width 14") == 1
 
 
-def test_pairs_that_hardly_leave_the_horizon_are_named() -> None:
-    """By the published study, of which most pairs are equal because nothing learns in time."""
+def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
+    """By the published study, of which some pairs are equal because neither learns in time."""
     outcome = api.read_study("dissecting")
     late = {name for name, time in outcome.mean_times().items() if time.mean >= 90_000}
-    expected = [
-        f"{pair.first} / {pair.second}" for pair in outcome.pairs if {pair.first, pair.second} <= late
+    pairs = {f"{pair['first']} / {pair['second']}": pair for pair in outcome.as_dict()["pairs"]}
+    for pair in pairs.values():
+        equal = pair["decided"] in ("equal", "not told apart")
+        assert pair["at_horizon"] == (equal and {pair["first"], pair["second"]} <= late)
+    assert [name for name, pair in pairs.items() if pair["at_horizon"]] == [
+        "skolik 5 layers, outputs 16 times / skolik 5 layers",
+        "skolik 5 layers, outputs 16 times / skolik 5 layers, output rate x 16",
+        "skolik 5 layers / skolik 2 layers",
+        "skolik 5 layers / skolik 5 layers, separable",
     ]
-    assert 0 < len(expected) < len(outcome.pairs)
+    assert pairs["hsiao, ring of CNOTs / hsiao"]["verdict"] == "hsiao needs fewer", (
+        "known to differ all the same"
+    )
     shown = " ".join(say("show", "dissecting").stdout.split())
-    assert "both entries are below the thresholds for 90% or more of the 100k steps" in shown
-    assert f"says little: {'; '.join(expected)}. Give a study of them more epochs" in shown
-    assert "both entries are" not in say("show", "quantum-or-not").stdout
+    assert (
+        shown.count("at the horizon: both entries are below the thresholds for 90% or more of the steps") == 1
+    )
+    assert "at the horizon" not in say("show", "quantum-or-not").stdout
 
 
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:

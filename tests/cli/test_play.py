@@ -131,6 +131,19 @@ def test_an_agent_acts_in_a_loop_of_ones_own(train: Train, tmp_path: Path) -> No
         OptionError, match=r"observations of shape \(2, 5\): task 'tiny' has 3 .* one alone is \(1, 3\)"
     ):
         agent.act(np.zeros((2, 5)))
+    for seen, message in (
+        (np.full((1, 3), np.nan), "observations are not finite"),
+        (np.full((1, 3), 1e300), "observations are not finite"),
+        ({"seen": 1}, "of type dict are no array of real numbers"),
+        (["a"], "of type list are no array of real numbers"),
+        ([[1, 2, 3], [1]], "of type list are no array of real numbers"),
+        (np.zeros((2, 3), complex), "are no array of real numbers"),
+        (np.zeros((0, 3)), "observations of shape"),
+        (np.zeros(3), "observations of shape"),
+        (np.zeros((1, 3, 1)), "observations of shape"),
+    ):
+        with pytest.raises(OptionError, match=message):
+            agent.act(seen)  # type: ignore[arg-type]
     for bad, message in ((7, "has no seed 7"), (True, "seed = True: give a whole number")):
         with pytest.raises(QrlSuiteError, match=message):
             api.agent(str(store.path), seed=bad, runs=tmp_path / "runs")
@@ -143,6 +156,32 @@ def test_an_agent_that_remembers_is_told_where_episodes_begin(train: Train, tmp_
     with pytest.raises(OptionError, match=r"'ppo' remembers episodes: give act\(\) where they begin"):
         agent.act(observations)
     assert agent.act(observations, np.ones(2, bool), infos).shape == (2,)
+    other = api.agent(str(store.path), runs=tmp_path / "runs")
+    for _ in range(3):
+        chosen = agent.act(observations, np.array([True, False]))
+        assert np.array_equal(other.act(observations, np.array([1, 0], np.uint8)), chosen), "0 and 1 will do"
+    for bad in (np.ones(3, bool), [0.5, 1], True, ["yes", "no"], np.array([2, 0])):
+        with pytest.raises(OptionError, match="begins: give 2 truth values"):
+            agent.act(observations, bad)  # type: ignore[arg-type]
+
+
+def test_an_agent_of_a_task_with_masks_is_told_what_can_be_chosen(tmp_path: Path) -> None:
+    store = EntryStore(trainer("taxi", tmp_path)("runs", [0], 1, "ddqn mlp", ("width=2",)))
+    agent = api.agent(str(store.path), runs=tmp_path / "runs")
+    observations, infos = agent.environments(20).reset(seed=0)
+    chosen = agent.act(observations, infos=infos)
+    mask = infos["action_mask"]
+    assert mask[np.arange(20), chosen].all()
+    for missing in (None, {}, {"action_mask": mask[:3]}, {"action_mask": mask[0]}):
+        with pytest.raises(OptionError, match=r"task 'taxi' says what can be chosen: give act\(\) the infos"):
+            agent.act(observations, infos=missing)
+
+
+def test_a_published_agent_plays_another_task() -> None:
+    entry = "beam6g/ddqn-vqc-native-220c0736"
+    agent = api.agent(entry, task="beam6g-degree5", seed=7, published=True, runs="none")
+    assert (agent.seed, agent.task, agent.entry.task.name) == (7, "beam6g-degree5", "beam6g-degree5")
+    assert agent.act(agent.environments(3).reset(seed=0)[0]).shape == (3,)
 
 
 def test_any_environment_that_draws_frames(tmp_path: Path) -> None:
