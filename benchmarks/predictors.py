@@ -168,7 +168,7 @@ def draw(drawn: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], out:
     """Draw outcomes against every diagnostic, two rows for each size."""
     from matplotlib.figure import Figure
 
-    figure = Figure((9, 4.6 * len(drawn)), layout="constrained")
+    figure = Figure((10, 4.6 * len(drawn)), layout="constrained")
     axes = figure.subplots(2 * len(drawn), 4, squeeze=False, sharey=True)
     for n, (values, outcomes), lines in zip(drawn, drawn.values(), axes.reshape(len(drawn), 8)):
         error = outcomes.std(1, ddof=1) / np.sqrt(outcomes.shape[1])

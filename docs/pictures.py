@@ -93,7 +93,7 @@ PICTURES: dict[str, Picture] = {
     "report-pairs.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1000, "Who outperforms whom"),
     "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1300),
     "predictors.png": Unpublished(
-        "benchmarks/predictors.py --qubits 6 --out predictors.png", program="python"
+        "benchmarks/predictors.py --qubits 6 8 --out predictors.png", program="python"
     ),
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
