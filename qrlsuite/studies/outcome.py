@@ -222,7 +222,7 @@ class StudyOutcome(Shown):
             yield Text(
                 f"at the horizon: both entries are {study.grid.before} the thresholds for {NEAR:.0%} or more of the "
                 "steps. That they are equal, or not told apart, says little there: neither had the time to learn. "
-                "Plan a new study with more epochs"
+                "A study with more epochs may tell"
             )
         if state.begun_at:
             yield Text(f"hash {study.hash}, first seed begun {state.begun_at}")
