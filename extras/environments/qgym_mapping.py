@@ -21,8 +21,8 @@ from qgym.envs import InitialMapping
 class QgymMapping(gymnasium.Env[Any, Any]):
     """A random graph of `qubits` circuit qubits that interact is mapped to a line of physical qubits.
 
-    Observations, actions and rewards are the package's: an action is a pair of a physical and a circuit qubit, one that
-    is taken already earns -100, and a complete mapping earns by how many interactions lie on the line.
+    Observations, actions and rewards are the package's. An action is a pair of a physical and a circuit qubit. It earns
+    -100 if one of them is mapped already, else 5 for each mapped interaction on the line and -1 for each off it.
     """
 
     metadata = {"render_modes": []}

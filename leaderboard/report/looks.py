@@ -13,6 +13,7 @@ from qrlsuite.results.seeds import format_seeds
 from qrlsuite.studies.outcome import (
     StudyOutcome,
     difference_text,
+    horizon_note,
     needs_text,
     reason_note,
     versus,
@@ -108,7 +109,7 @@ def view(outcome: StudyOutcome) -> StudyView:
         name=clean(study.name),
         question=clean(study.file.summary, 300),
         facts=tuple((term, clean(value, 600)) for term, value in _facts(outcome, plain)),
-        note=clean(reason_note(study), 600),
+        note=". ".join(filter(None, (clean(reason_note(study), 600), horizon_note(outcome)))),
         pairs=pairs,
         looks=tuple(_look(outcome, index) for index in range(len(study.design.looks))),
         picture=_picture(outcome),

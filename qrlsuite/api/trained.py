@@ -72,11 +72,11 @@ class TrainedAgent:
             If an argument has another shape or values that are not finite, or is needed and absent.
         """
         seen = self._seen(observations)
-        mask = np.asarray((infos or {}).get("action_mask"))
-        if self._masked and mask.shape[:1] != (len(seen),):
+        wanted = None if self._choices is None else (len(seen), self._choices)
+        if wanted is not None and np.shape((infos or {}).get("action_mask", ())) != wanted:
             raise OptionError(
                 f"task '{self.task}' says what can be chosen: give act() the infos of the environments, whose "
-                f"'action_mask' has {len(seen)} rows here"
+                f"'action_mask' has the shape {wanted} here"
             )
         try:
             return self.trainer.act(seen, None if begins is None else _begins(begins, len(seen)), infos)
@@ -84,8 +84,10 @@ class TrainedAgent:
             raise OptionError(str(error)) from None
 
     @cached_property
-    def _masked(self) -> bool:
-        return "action_mask" in self.environments().reset(seed=0)[1]
+    def _choices(self) -> int | None:
+        """How many choices the task's masks have; None where it has none."""
+        _, infos = self.environments().reset(seed=0)
+        return len(infos["action_mask"][0]) if "action_mask" in infos else None
 
     def _seen(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         envs = self.trainer.envs
@@ -94,11 +96,7 @@ class TrainedAgent:
         said = f"task '{self.task}' has {size} numbers each, so give (B, {size}); one alone is (1, {size})"
         try:
             given = np.asarray(observations)
-        except (
-            TypeError,
-            ValueError,
-            RuntimeError,
-        ):  # rows of unequal length, or a tensor that needs its gradient
+        except (TypeError, ValueError, RuntimeError):  # ragged rows, or a tensor that needs its gradient
             given = np.empty(0, object)
         if given.dtype.kind not in "biuf":
             raise OptionError(

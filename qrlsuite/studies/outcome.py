@@ -218,12 +218,8 @@ class StudyOutcome(Shown):
                 f"steps {study.grid.before} threshold: of a run of the entry, mean over seeds and thresholds, at its "
                 "last look"
             )
-        if any(map(self.late, self.pairs)):
-            yield Text(
-                f"at the horizon: both entries are {study.grid.before} the thresholds for {NEAR:.0%} or more of the "
-                "steps. That they are equal, or not told apart, says little there: neither had the time to learn. "
-                "A study with more epochs may tell"
-            )
+        if note := horizon_note(self):
+            yield Text(note)
         if state.begun_at:
             yield Text(f"hash {study.hash}, first seed begun {state.begun_at}")
         for seeds, when in facts["looks_taken"].items():
@@ -328,6 +324,17 @@ def reason_note(study: StudyWithLooks) -> str:
     return (
         "NOTE: it looks below 20 seeds, where rare failures that have not occurred yet decide too much. Reason "
         f"given: {study.looks.reason}"
+    )
+
+
+def horizon_note(outcome: StudyOutcome) -> str:
+    """Say what a verdict at the horizon means; empty where there is none."""
+    if not any(map(outcome.late, outcome.pairs)):
+        return ""
+    return (
+        f"at the horizon: both entries are {outcome.study.grid.before} the thresholds for {NEAR:.0%} or more of the "
+        "steps. That they are equal, or not told apart, says little there: neither had the time to learn. A study with "
+        "more epochs may tell"
     )
 
 

@@ -28,6 +28,7 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.pictures import outcome as drawing
+from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies import together
@@ -724,6 +725,11 @@ def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
         shown.count("at the horizon: both entries are below the thresholds for 90% or more of the steps") == 1
     )
     assert "at the horizon" not in say("show", "quantum-or-not").stdout
+    page = looks_report.view(outcome)
+    assert [line.verdict.endswith(", at the horizon") for line in page.pairs] == [
+        pair["at_horizon"] for pair in pairs.values()
+    ]
+    assert "neither had the time to learn" in page.note
 
 
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:

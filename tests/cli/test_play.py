@@ -172,7 +172,13 @@ def test_an_agent_of_a_task_with_masks_is_told_what_can_be_chosen(tmp_path: Path
     chosen = agent.act(observations, infos=infos)
     mask = infos["action_mask"]
     assert mask[np.arange(20), chosen].all()
-    for missing in (None, {}, {"action_mask": mask[:3]}, {"action_mask": mask[0]}):
+    for missing in (
+        None,
+        {},
+        {"action_mask": mask[:3]},
+        {"action_mask": mask[0]},
+        {"action_mask": mask[:, :1]},
+    ):
         with pytest.raises(OptionError, match=r"task 'taxi' says what can be chosen: give act\(\) the infos"):
             agent.act(observations, infos=missing)
 
