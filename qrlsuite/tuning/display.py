@@ -157,7 +157,8 @@ class TuneDisplay:
         self.close()
         done = sum(len(search.trials) for search in self.searches)
         self.console.print(
-            f"stopped after {done} trials; every finished epoch is saved. The same {self.again} continues from there.",
+            f"stopped after {counted(done, 'trial')}; every finished epoch is saved. "
+            f"The same {self.again} continues from there.",
             soft_wrap=True,
         )
 

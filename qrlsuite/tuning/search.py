@@ -30,7 +30,7 @@ from qrlsuite.options import Setting
 from qrlsuite.results import provenance
 from qrlsuite.results.seeds import format_seeds, read_seeds
 from qrlsuite.results.store import EntryStore, write_atomically
-from qrlsuite.results.text import hours_text, steps_text
+from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.tuning import samplers, space
 from qrlsuite.tuning.objective import Merit, Objective, cell_text, merit
 
@@ -127,12 +127,13 @@ def read_requests(
     vary:
         See `qrlsuite.tuning.space.read_varied`.
     sampler:
-        A name with options, `random trials=50 seed=1`; None takes all combinations of what is listed, else `bayesian`.
+        A name with options, `random trials=50 seed=1`; None takes all combinations of what is listed, else, or where
+        settings are given, `bayesian`.
     seeds:
         As `tuning_seeds` reads them; None takes `SEEDS`.
     """
     grid, varied, rows = space.read_varied(vary)
-    name, chosen = samplers.read(sampler or ("grid" if grid or varied else "bayesian"))
+    name, chosen = samplers.read(sampler or ("grid" if (grid or varied) and not rows else "bayesian"))
     if name != "bayesian" and (rows or chosen.regret is not None):
         what = f"--vary '{rows[0]}'" if rows else "regret"
         raise OptionError(f"{what} is for --sampler bayesian, and not for {name}")
@@ -270,8 +271,8 @@ class Search(Shown):
         """Say how many settings are tried on how many seeds."""
         seeds = self.request.seeds
         return (
-            f"{self.planned} trials ({samplers.NAMES[self.request.sampler]}), each {len(seeds)} seeds "
-            f"({format_seeds(seeds)})"
+            f"{counted(self.planned, 'trial')} ({samplers.NAMES[self.request.sampler]}), "
+            f"each {counted(len(seeds), 'seed')} ({format_seeds(seeds)})"
         )
 
     @property

@@ -38,6 +38,8 @@ FOLDER = "search"
 _WORD = r"[^\s={\[]+=[^\s={\[]+"
 ROW = re.compile(rf"preset=\S+(\s+{_WORD})*|{_WORD}(\s+{_WORD})+")
 """Settings given by hand."""
+_ALONE = re.compile(r"[^\s={\[,]+=[^\s={\[,]+")
+"""One value of one option: settings given by hand beside other such settings, else a list of one value."""
 Point = dict[str, Any]
 """A value for every dimension, by its full name (`algorithm.lr`)."""
 
@@ -260,8 +262,11 @@ def read_varied(
         varied = {name: list(v) if isinstance(v, tuple) else v for name, v in vary.items()}
         return None, tuple(options.from_mapping(varied)), ()
     words = [vary] if isinstance(vary, str) else list(vary)
-    rows = tuple(word.strip() for word in words if ROW.fullmatch(word.strip()))
-    words = [word for word in words if word.strip() not in rows]
+    words = [word.strip() for word in words]
+    rows = tuple(word for word in words if ROW.fullmatch(word))
+    if rows:
+        rows = tuple(word for word in words if word in rows or _ALONE.fullmatch(word))
+    words = [word for word in words if word not in rows]
     grids = [word for word in words if "=" not in word]
     if len(grids) > 1:
         raise OptionError(f"--vary {grids[0]} --vary {grids[1]}: give one grid")

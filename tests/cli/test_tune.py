@@ -88,7 +88,7 @@ def test_two_models_with_equal_budgets(tiny_task: str, tmp_path: Path) -> None:
 
 def test_it_says_the_size_first_and_wants_large_searches_confirmed(tiny_task: str, tmp_path: Path) -> None:
     words = ["tune", "mlp", "--task", tiny_task, "--vary", "paper", "--runs", str(tmp_path / "runs")]
-    assert "2160 trials" in say(*words, "--dry-run").stderr
+    assert "2,160 trials" in say(*words, "--dry-run").stderr
     with pytest.raises(QrlSuiteError, match="--yes starts them all"):
         say(*words)
     assert not (tmp_path / "runs").exists()
