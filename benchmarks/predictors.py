@@ -38,8 +38,8 @@ CIRCUITS = [
     "ansatz=jerbi",
     "ansatz=hsiao",
     "ansatz=perez-salinas",
-    "ansatz=wang state=ghz",
-    "ansatz=wang state=graph",
+    "ansatz=wang coupling=ghz",
+    "ansatz=wang coupling=graph",
     "ansatz=basic",
 ]
 RATES = [(5e-4, 1e-3), (1e-3, 2e-3), (2e-3, 4e-3)]

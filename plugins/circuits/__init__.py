@@ -47,7 +47,7 @@ def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
         ),
         (
             "wang",
-            "Re-uploading on a GHZ or graph state, which is undone behind it; options: state, edges, entangled",
+            "Re-uploading with rings of CZs or trained ZZ, measured in X; options: coupling, edges, entangled",
             "WangOptions",
         ),
         (

@@ -105,9 +105,13 @@ class PerezSalinasOptions:
 class WangOptions:
     """Options of `wang`."""
 
-    state: Annotated[
-        Literal["ghz", "graph"], Field(description="entangled state before the layers, undone behind them")
-    ] = "ghz"
+    coupling: Annotated[
+        Literal["cz", "zz", "ghz", "graph"],
+        Field(
+            description="cz, zz: a ring of CZs, or of ZZ rotations with trained angles, behind every layer; "
+            "ghz, graph: an entangled state before the layers, undone behind them"
+        ),
+    ] = "cz"
     edges: Annotated[
         str, Field(description="of the graph state: ring, or pairs of qubits such as '0-1 1-2'")
     ] = "ring"
@@ -266,41 +270,52 @@ def perez_salinas(qubits: int, layers: int, options: PerezSalinasOptions) -> Cir
 
 
 def wang(qubits: int, layers: int, options: WangOptions) -> Circuit:
-    """Build the circuit between an entangled state and its inverse of Wang, Hymas & Quach (2026, arXiv:2603.10289).
+    """Build the circuits of Wang, Hymas & Quach (2026, arXiv:2603.10289) for Pong, after their code (`QRL-Pong`).
 
-    After the authors' code for Pong (`QRL-Pong`, `VQCBackbones2.py`); of the paper the abstract was read, and its
-    circuits with CZ or IsingZZ gates are not here. The circuit prepares a GHZ state (H on qubit 0, and CNOTs from it to
-    every other) or a graph state (H on every qubit, a CZ for every edge), applies in every layer U3 on every qubit with
-    angles `scaling * input[q] + weights`, and undoes the state. All parameters start uniform in [0, 1). Separable is
-    without the state, as the authors have it. Their GHZ state begins at qubit 1 of 8, and they measure three qubits.
+    Every layer has U3 on every qubit with angles `scaling * input[q] + weights`, then a closed ring of CZs, or with
+    `coupling = "zz"` of ZZ rotations with trained angles (on two qubits a single gate). X of every qubit is measured:
+    an H stands before each measurement of Z. `coupling = "ghz"` and "graph" are the circuits of an earlier version
+    (`VQCBackbones2.py`), without the rings and the H: a GHZ state (H on qubit 0, and CNOTs from it to every other) or a
+    graph state (H on every qubit, a CZ for every edge) is prepared, and undone behind the layers. Separable is the same
+    circuit without the rings or the state, as the authors have it. All parameters start uniform in [0, 1).
+
+    Of the paper the abstract was read, and of its code not the last version: that X is measured is told by the names of
+    its runs (`XObs`), and where the angles of ZZ start is a guess. Their inputs are multiplied by 2 pi:
+    `init_scale=6.283185307`. Their GHZ state begins at qubit 1 of 8, and they measured three qubits then.
 
     Raises
     ------
     OptionError
-        For edges that are no pairs of qubits, or are there twice; or edges of a GHZ state.
+        For edges that are no pairs of qubits, or are there twice; or edges of another coupling than a graph state.
     """
     circuit = _begun(qubits, options.entangled)
     scaling = circuit.parameter("scaling", (layers, qubits, 3), high=1.0)
     weights = circuit.parameter("weights", (layers, qubits, 3), high=1.0)
-    edges = _edges(qubits, options)
-    entangled = options.entangled != "separable"
-    if entangled and options.state == "ghz":
-        circuit.append("H", 0)
-    elif entangled:
-        _hadamards(circuit)
-    gate = "CNOT" if options.state == "ghz" else "CZ"
-    for edge in edges if entangled else ():
-        circuit.append(gate, edge)
+    edges = _edges(qubits, options) if options.entangled != "separable" else []
+    rings = options.coupling in ("cz", "zz")
+    zz = (
+        circuit.parameter("zz", (layers, len(edges)), high=1.0)
+        if edges and options.coupling == "zz"
+        else None
+    )
+    state = [] if rings else edges
+    if state:
+        _hadamards(circuit, 1 if options.coupling == "ghz" else qubits)
+    for edge in state:
+        circuit.append("CNOT" if options.coupling == "ghz" else "CZ", edge)
     for layer in range(layers):
         for q in range(qubits):
             angles = [scaling[layer, q, k] * circuit.input(q) + weights[layer, q, k] for k in range(3)]
             circuit.append("U3", q, *angles)
-    for edge in reversed(edges) if entangled else ():
-        circuit.append(gate, edge)
-    if entangled and options.state == "ghz":
-        circuit.append("H", 0)
-    elif entangled:
-        _hadamards(circuit)
+        for k, edge in enumerate(edges if rings else ()):
+            if zz is None:
+                circuit.append("CZ", edge)
+            else:
+                circuit.append("RZZ", edge, zz[layer, k])
+    for edge in reversed(state):
+        circuit.append("CNOT" if options.coupling == "ghz" else "CZ", edge)
+    if state or rings:
+        _hadamards(circuit, 1 if options.coupling == "ghz" else qubits)
     return circuit
 
 
@@ -332,9 +347,9 @@ def _begun(qubits: int, entangled: str | bool, inputs: int | None = None) -> Cir
 
 def _edges(qubits: int, options: WangOptions) -> list[tuple[int, int]]:
     """Return the pairs of qubits that the gates of `wang` join."""
-    if options.state == "ghz" and options.edges != "ring":
-        raise OptionError(f"edges = '{options.edges}': a GHZ state has none; set state=graph")
-    if options.state == "ghz":
+    if options.coupling != "graph" and options.edges != "ring":
+        raise OptionError(f"edges = '{options.edges}': only a graph state has them; set coupling=graph")
+    if options.coupling == "ghz":
         return [(0, q) for q in range(1, qubits)]
     if options.edges == "ring":
         return _ring_edges(qubits)
@@ -390,9 +405,9 @@ def _variational(
         circuit.append({"rot": "Rot", "u3": "U3"}[gate], target, *angles, control=control)
 
 
-def _hadamards(circuit: Circuit) -> None:
-    """Append H on every qubit."""
-    for q in range(circuit.qubits):
+def _hadamards(circuit: Circuit, count: int | None = None) -> None:
+    """Append H on every qubit, or on the first `count`."""
+    for q in range(circuit.qubits if count is None else count):
         circuit.append("H", q)
 
 

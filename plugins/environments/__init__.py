@@ -90,6 +90,20 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
     )
     register(
         EnvironmentSpec(
+            name="pong",
+            summary="Pong: play against an opponent that follows the ball",
+            options=f"{_HERE}.pong:PongOptions",
+            gymnasium_id="qrlsuite/Pong-v1",
+            entry_point=f"{_HERE}.pong:Pong",
+            vector=f"{_HERE}.pong:PongLanes",
+            policies={
+                "steep returns": f"{_HERE}.pong:SteepReturns",
+                "follows the ball": f"{_HERE}.pong:Follower",
+            },
+        )
+    )
+    register(
+        EnvironmentSpec(
             name="planted",
             summary="Planted: classify points as a hidden circuit of 2 qubits does",
             options=f"{_HERE}.planted:PlantedOptions",

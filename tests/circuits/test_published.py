@@ -62,13 +62,23 @@ def perez_salinas(x: Any, p: Given, n: int, layers: int, pairs: Any = ()) -> Non
                 qml.CZ(pair)
 
 
-def wang(x: Any, p: Given, n: int, layers: int, state: Callable[[], None] | None = None) -> None:
-    """`QRL-Pong`: the functions of `VQCBackbones2.py`."""
+def wang(
+    x: Any, p: Given, n: int, layers: int, state: Callable[[], None] | None = None, ring: str = ""
+) -> None:
+    """`QRL-Pong`: the functions of `VQCBackbones.py`, measured in X, and with a state those of `VQCBackbones2.py`."""
     if state:
         state()
     for layer in range(layers):
         for q in range(n):
             qml.U3(*(p["scaling"][layer, q] * x[q] + p["weights"][layer, q]), wires=q)
+        for q in range(n):
+            if ring == "cz":
+                qml.CZ([q, (q + 1) % n])
+            elif ring == "zz":
+                qml.IsingZZ(p["zz"][layer, q], [q, (q + 1) % n])
+    if ring:
+        for q in range(n):
+            qml.Hadamard(q)
     if state:
         qml.adjoint(state)()
 
@@ -105,10 +115,13 @@ CASES: list[tuple[str, Given, int, Callable[..., None], Given]] = [
     ("perez-salinas", {"inputs": 2}, 2, perez_salinas, {"pairs": [[(0, 1)]] * 2}),
     ("perez-salinas", {"inputs": 4}, 4, perez_salinas, {"pairs": BRICKS}),
     ("perez-salinas", {"entangled": "separable"}, 4, perez_salinas, {}),
-    ("wang", {}, 4, wang, {"state": ghz}),
-    ("wang", {"state": "graph"}, 4, wang, {"state": graph((0, 1), (1, 2), (2, 3), (3, 0))}),
-    ("wang", {"state": "graph", "edges": "3-0 1-3"}, 4, wang, {"state": graph((3, 0), (1, 3))}),
-    ("wang", {"entangled": "separable"}, 4, wang, {}),
+    ("wang", {}, 4, wang, {"ring": "cz"}),
+    ("wang", {"coupling": "zz"}, 4, wang, {"ring": "zz"}),
+    ("wang", {"entangled": "separable"}, 4, wang, {"ring": "none"}),
+    ("wang", {"coupling": "ghz"}, 4, wang, {"state": ghz}),
+    ("wang", {"coupling": "graph"}, 4, wang, {"state": graph((0, 1), (1, 2), (2, 3), (3, 0))}),
+    ("wang", {"coupling": "graph", "edges": "3-0 1-3"}, 4, wang, {"state": graph((3, 0), (1, 3))}),
+    ("wang", {"coupling": "ghz", "entangled": "separable"}, 4, wang, {}),
     ("basic", {}, 4, basic, {}),
     ("basic", {}, 2, basic, {}),
     ("basic", {"encoding": "basis"}, 3, basic, {"bits": True}),
@@ -164,15 +177,15 @@ def test_features_are_divided_evenly_among_gates() -> None:
     ("name", "layers", "options", "message"),
     [
         ("perez-salinas", 1, {}, "1 layer and 3 inputs: .* needs 2 layers or more"),
-        ("wang", 1, {"edges": "0-1"}, "a GHZ state has none; set state=graph"),
+        ("wang", 1, {"edges": "0-1"}, "only a graph state has them; set coupling=graph"),
         (
             "wang",
             1,
-            {"state": "graph", "edges": "0-1 1-0"},
+            {"coupling": "graph", "edges": "0-1 1-0"},
             "distinct pairs of qubits 0..3 such as '0-1 1-2'",
         ),
-        ("wang", 1, {"state": "graph", "edges": "0-4"}, "edges = '0-4': write ring, or distinct pairs"),
-        ("wang", 1, {"state": "graph", "edges": "0-1 line"}, "write ring"),
+        ("wang", 1, {"coupling": "graph", "edges": "0-4"}, "edges = '0-4': write ring, or distinct pairs"),
+        ("wang", 1, {"coupling": "graph", "edges": "0-1 line"}, "write ring"),
         ("basic", 1, {"encoding": "amplitude"}, "encoding = 'amplitude': .*'angle' or 'basis'"),
     ],
 )
@@ -188,8 +201,10 @@ def test_what_cannot_be_built_says_so(name: str, layers: int, options: Given, me
         ("hsiao", {}, 12, 0),
         ("hsiao", {"entangled": True}, 12, 12),
         ("perez-salinas", {"inputs": 4}, 12 * (4 + 3 * 2), 4),
-        ("wang", {}, 6 * 12, 6),
-        ("wang", {"state": "graph"}, 6 * 12, 8),
+        ("wang", {}, 6 * 12, 12),
+        ("wang", {"coupling": "zz"}, 7 * 12, 24),
+        ("wang", {"coupling": "ghz"}, 6 * 12, 6),
+        ("wang", {"coupling": "graph"}, 6 * 12, 8),
         ("basic", {}, 12, 12),
     ],
 )
