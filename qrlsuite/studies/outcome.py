@@ -396,18 +396,20 @@ def _number(value: float) -> float | None:
 
 def _sheet(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Sheet:
     """Return the table of some pairs."""
-    heads = ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs")
+    heads = ["pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"]
     rows = [
-        (
+        [
             versus(pair),
             outcome.verdict(pair),
             str(pair.n_runs),
             *difference_text(pair, outcome.study.grid),
             f"{pair.p[-1]:.2g}" if pair.p else "",
             needs_text(outcome, facts["needs"]),
-        )
+        ]
         for pair, facts in pairs
     ]
+    if not any(row[-1] for row in rows):
+        heads, rows = heads[:-1], [row[:-1] for row in rows]
     return Sheet.of("", heads, rows, words=(heads[0], "verdict", "B against A", "interval", "needs"))
 
 
