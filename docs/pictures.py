@@ -125,6 +125,9 @@ PICTURES: dict[str, Picture] = {
         )
         for kind in ("pairs", "entries")
     },
+    "study-larger-batch-entries.png": Plot(
+        "study draw larger-batch", ("plans/larger-batch", "plans/larger-batch/beam6g/*")
+    ),
     "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
     "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),
     "episode-vqe.png": Plot("plot episode seed=2 --task vqe-ising", ()),
@@ -145,6 +148,7 @@ CAPTIONS = {
     "study-fidelity-text.png": "The text's replay buffer and copies",
     "study-quantum-or-not-entries.png": "A study with looks: every entry",
     "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
+    "study-larger-batch-entries.png": "A study with looks: where models learn in a third of the steps",
     "predictors.png": "Sixteen circuits: how fast they learn, and what was known of them before",
     "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",
     "diagnose-agents.png": "Trained agents beside themselves before training",
