@@ -291,7 +291,9 @@ def wang(qubits: int, layers: int, options: WangOptions) -> Circuit:
     circuit = _begun(qubits, options.entangled)
     scaling = circuit.parameter("scaling", (layers, qubits, 3), high=1.0)
     weights = circuit.parameter("weights", (layers, qubits, 3), high=1.0)
-    edges = _edges(qubits, options) if options.entangled != "separable" else []
+    edges = _edges(qubits, options)
+    if options.entangled == "separable":
+        edges = []
     rings = options.coupling in ("cz", "zz")
     zz = (
         circuit.parameter("zz", (layers, len(edges)), high=1.0)

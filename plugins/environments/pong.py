@@ -61,8 +61,8 @@ class Pong(OneLane):
 
     Rules and sizes are those of PufferLib's Pong (`ocean/pong/pong.h`; in its settings, `frames` is 8 and `points` 21).
     Three things are ours: `serve`, because a game from two serves can be learned by heart; the time limit; and that the
-    agent sees points and the new serve at once. There, points are seen when the game is over, and right after a point
-    the observation is the one before it. The code is ours.
+    agent sees points and the new serve at once. There, points are divided as integers and seen as 0, and right after a
+    point the observation is the one before it. The code is ours.
 
     ## Action Space
 
@@ -258,7 +258,7 @@ class PongLanes(EpisodeLanes):
 
 
 class Follower:
-    """The reference policy that follows the ball as the opponent does: it loses hardly a point, and wins none."""
+    """The reference policy that follows the ball, once a step: with 8 frames a step it loses most games."""
 
     def __init__(self, envs: LaneEnv) -> None:
         if not isinstance(envs, PongLanes):
@@ -280,7 +280,7 @@ class Follower:
 class SteepReturns(Follower):
     """The reference policy that hits in motion, so that the ball becomes too steep for the opponent.
 
-    It knows where the ball will arrive. It waits a step's way off, and moves in the ball's own direction as it hits.
+    It knows where the ball will arrive. It waits half a step's way off, and moves in the ball's direction as it hits.
     """
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:

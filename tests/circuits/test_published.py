@@ -178,6 +178,8 @@ def test_features_are_divided_evenly_among_gates() -> None:
     [
         ("perez-salinas", 1, {}, "1 layer and 3 inputs: .* needs 2 layers or more"),
         ("wang", 1, {"edges": "0-1"}, "only a graph state has them; set coupling=graph"),
+        ("wang", 1, {"edges": "0-1", "entangled": "separable"}, "only a graph state has them"),
+        ("wang", 1, {"coupling": "graph", "edges": "junk", "entangled": "separable"}, "write ring"),
         (
             "wang",
             1,

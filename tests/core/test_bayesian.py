@@ -349,9 +349,12 @@ def test_places_and_values_undo_each_other() -> None:
             assert bayesian.place_of(ends, value) == pytest.approx(place, abs=2e-3)
 
 
-def test_one_value_beside_settings_is_settings_too() -> None:
+def test_one_value_beside_settings_is_settings_too(tiny_task: str) -> None:
     assert space.read_varied(["lr=.002", "lr=.003 batch=32"]) == (None, (), ("lr=.002", "lr=.003 batch=32"))
     _, (lr,), rows = space.read_varied(["lr=.002"])
     assert (lr.name, lr.value, rows) == ("lr", [0.002], ())
     _, (lr,), rows = space.read_varied(["lr=.002,.004", "lr=.003 batch=32"])
     assert (lr.value, rows) == ([0.002, 0.004], ("lr=.003 batch=32",))
+    for vary, sampler in ((["lr=.002,.004"], "grid"), (["lr=.002,.004", "lr=.002 epsilon=.2"], "bayesian")):
+        [wanted] = search.read_requests(tiny_task, ["mlp"], vary, None, None, None, "time", None)
+        assert wanted.sampler == sampler

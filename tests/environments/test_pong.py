@@ -85,7 +85,7 @@ def test_games_follow_the_rules(frames: int, serve: float) -> None:
     assert ended > 10
 
 
-def test_who_follows_survives_and_who_hits_in_motion_wins() -> None:
+def test_who_follows_wins_a_point_at_times_and_who_hits_in_motion_wins() -> None:
     policies = (None, Follower, SteepReturns)
     random, follower, steep = (scores(PongLanes(PongOptions(), 100), p).mean() for p in policies)
     assert random < 0.01 < 0.1 < follower < 0.5 < 0.95 < steep
@@ -94,8 +94,8 @@ def test_who_follows_survives_and_who_hits_in_motion_wins() -> None:
 def test_a_time_limit_truncates() -> None:
     game = Pong(steps=3)
     game.reset(seed=0)
-    *_, info = [game.step(0) for _ in range(3)][-1]
-    assert info["score"] == 0.5
+    *_, terminated, truncated, info = [game.step(0) for _ in range(3)][-1]
+    assert (terminated, truncated, info["score"]) == (False, True, 0.5)
     with pytest.raises(OptionError, match="points"):
         Pong(points=0)
 
