@@ -28,6 +28,13 @@ def percent(value: float) -> str:
         ("dissecting-layers", "5 layers", "5 layers, separable", "without its CZs, {} more steps " + LEADING),
         ("dissecting-layers", "5 layers", "5 layers, mean-field", "needs {} more steps ({} to {})"),
         ("dissecting", "hsiao, outputs 16 times", "hsiao, output rate x 16", "needs {} more steps ({} to {})"),
+        ("pong-entanglement", "8 qubits, trained ZZ", "8 qubits, separable", "needs {} more steps ({} to {}) than"),
+        (
+            "pong-entanglement",
+            "8 qubits, CZ",
+            "8 qubits, separable",
+            "{} more than with CZs ({} to {}; to reach 0.4, {}, {} to {})",
+        ),
     ],
 )  # fmt: skip
 def test_differences_are_those_of_the_studies(study: str, first: str, second: str, said: str) -> None:
@@ -54,3 +61,15 @@ def test_seeds_that_learned_and_hours_are_those_of_the_studies() -> None:
         (0, 40),
     ]
     assert "21 of 80 seeds with five layers, 5 of 40 with two, none with one" in PAGE
+
+
+def test_a_network_needs_far_fewer_steps_on_pong() -> None:
+    outcome = tables.published("pong-entanglement")
+    [pair] = [p for p in outcome.pairs if p.second == "width 6"]
+    assert pair.verdict == "width 6 needs fewer"
+    values = [percent(-value) for value in (pair.difference, pair.interval[1], pair.interval[0])]
+    assert "a network of its size needs {} fewer than the CZs ({} to {})".format(*values) in PAGE
+    facts = outcome.as_dict()["entries"]
+    assert f"| {sum(each['core_hours'] for each in facts):.2f} |" in PAGE
+    times = [f"{time.mean / 1000:.0f}k" for time in outcome.mean_times().values()]
+    assert f"is at {times[3]} steps, the circuits at {times[1]} to {times[2]}" in PAGE
