@@ -3,7 +3,8 @@
     python benchmarks/predictors.py --qubits 6 8 [--runs DIR] [--workers N] [--out FILE.png]
 
 Written before the first of its seeds. Task beam6g, DDQN with the released settings, hybrid circuits of 4 layers with
-6 and with 8 qubits: every built-in ansatz with every gate or state it has, 16 circuits of each size.
+6 and with 8 qubits: every built-in ansatz with every gate or state it has, 16 circuits of each size
+(`wang` with its states; its rings came later).
 
 1. *Learning rates.* Each circuit gets three: the released ones times 1, 2, and 4. The best has the fewest mean steps
    below threshold on seeds 40,000 to 40,007.

@@ -295,29 +295,27 @@ def wang(qubits: int, layers: int, options: WangOptions) -> Circuit:
     if options.entangled == "separable":
         edges = []
     rings = options.coupling in ("cz", "zz")
-    zz = (
-        circuit.parameter("zz", (layers, len(edges)), high=1.0)
-        if edges and options.coupling == "zz"
-        else None
-    )
-    state = [] if rings else edges
+    ring, state = (edges, []) if rings else ([], edges)
+    gate, first = ("CNOT", 1) if options.coupling == "ghz" else ("CZ", qubits)
+    trained = options.coupling == "zz" and len(ring) > 0
+    zz = circuit.parameter("zz", (layers, len(ring)), high=1.0) if trained else None
     if state:
-        _hadamards(circuit, 1 if options.coupling == "ghz" else qubits)
+        _hadamards(circuit, first)
     for edge in state:
-        circuit.append("CNOT" if options.coupling == "ghz" else "CZ", edge)
+        circuit.append(gate, edge)
     for layer in range(layers):
         for q in range(qubits):
             angles = [scaling[layer, q, k] * circuit.input(q) + weights[layer, q, k] for k in range(3)]
             circuit.append("U3", q, *angles)
-        for k, edge in enumerate(edges if rings else ()):
+        for k, edge in enumerate(ring):
             if zz is None:
                 circuit.append("CZ", edge)
             else:
                 circuit.append("RZZ", edge, zz[layer, k])
     for edge in reversed(state):
-        circuit.append("CNOT" if options.coupling == "ghz" else "CZ", edge)
+        circuit.append(gate, edge)
     if state or rings:
-        _hadamards(circuit, 1 if options.coupling == "ghz" else qubits)
+        _hadamards(circuit, first)
     return circuit
 
 

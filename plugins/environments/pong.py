@@ -178,7 +178,7 @@ class PongLanes(EpisodeLanes):
     def _act(self, actions: NDArray[Any], running: BoolArray) -> tuple[FloatArray, BoolArray]:
         moves = STEPS[actions]
         rewards = np.zeros(self.num_envs)
-        flying = running & (self.points < self.options.points).all(1)
+        flying = running.copy()
         for _ in range(self.options.frames):
             hit, won, lost = self._frame(moves, flying)
             rewards = np.where(won, 1.0, np.where(lost, -1.0, np.where(hit, 0.1, rewards)))
@@ -239,7 +239,7 @@ class PongLanes(EpisodeLanes):
         return True
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return the first lane's field at half its size, (320, 270, 3): bars above the paddles are points."""
+        """Return the first lane's field at half its size, (320, 270, 3); bars at its top are both sides' points."""
         edge = int(PADDLE_WIDTH)
         image = np.full((int(HEIGHT), int(WIDTH) + 2 * edge, 3), 235, np.uint8)
         image[:, :edge] = image[:, -edge:] = 200
@@ -247,7 +247,7 @@ class PongLanes(EpisodeLanes):
 
         def block(x: float, y: float, width: float, height: float, color: tuple[int, int, int]) -> None:
             low, high = (round(float(np.clip(HEIGHT - at, 0, HEIGHT))) for at in (y, y + height))
-            image[high:low, max(round(x), 0) : round(x + width)] = color
+            image[high:low, round(x) : round(x + width)] = color
 
         block(0, other, PADDLE_WIDTH, PADDLE, (213, 94, 0))
         block(WIDTH + edge, own, PADDLE_WIDTH, PADDLE, (0, 114, 178))

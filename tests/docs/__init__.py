@@ -13,3 +13,8 @@ def load(name: str) -> ModuleType:
     if str(DOCS) not in sys.path:
         sys.path.append(str(DOCS))
     return importlib.import_module(name)
+
+
+def percent(value: float) -> str:
+    """Write a share as the pages do."""
+    return f"{100 * value:.0f}%"

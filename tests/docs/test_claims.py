@@ -7,16 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.docs import load
+from tests.docs import load, percent
 
 PAGE = " ".join((Path(__file__).parents[2] / "docs" / "claims.md").read_text().split())
 LEADING = "({} to {}; to reach 0.6, {}, {} to {})"
 
 tables = load("tables")
-
-
-def percent(value: float) -> str:
-    return f"{100 * value:.0f}%"
 
 
 @pytest.mark.parametrize(
