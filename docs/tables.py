@@ -5,6 +5,7 @@ A comment names the task or study and the kind of the table that follows it:
     <!-- table: beam6g tiers -->
     <!-- table: quantum-or-not verdicts -->
     <!-- table: quantum-or-not-degree5+quantum-or-not-a3-0 together -->
+    <!-- table: equal-size-beam6g+equal-size-pulse means -->
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [
     ROOT / page
     for page in (
+        "README.md",
         "docs/fidelity.md",
         "docs/leaderboard.md",
         "docs/plans.md",
@@ -44,19 +46,22 @@ Rows = Iterator[Sequence[str]]
 
 def settings(outcome: StudyOutcome) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
-    yield "entry", "parameters", "settings", "trials", "M"
-    for table in outcome.study.file.entries:
-        if table.tuning is None or table.tuning.value is None:  # the task's own settings
+    tuned = [(str(each.name), each.tuning) for each in outcome.study.file.entries if each.tuning is not None]
+    regrets = any(tuning.regret for _, tuning in tuned)
+    yield "entry", "parameters", "settings", "trials", *["expected regret"] * regrets, "M"
+    for name, tuning in tuned:
+        if tuning.value is None:  # the task's own settings
             continue
-        entry, tuning = outcome.study.entries[str(table.name)], table.tuning
+        entry = outcome.study.entries[name]
         found = []
         for option in tuning.space or ():
-            side, _, name = option.partition(".")
+            side, _, own = option.partition(".")
             options = entry.model_options if side == "model" else entry.algorithm_options
-            found.append(f"{name} {getattr(options, name):g}")
-        name = str(table.name).removesuffix(", tuned")
+            found.append(f"{own} {getattr(options, own):g}")
         parameters = str(sum(count_parameters(entry)))
-        yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(table.tuning.value)
+        regret = [f"{tuning.regret.expected:.0%}"] if tuning.regret else []
+        trials, steps = str(tuning.trials), steps_text(tuning.value)
+        yield name.removesuffix(", tuned"), parameters, ", ".join(found), trials, *regret, steps
 
 
 def verdicts(outcome: StudyOutcome) -> Rows:
@@ -95,6 +100,20 @@ def together(names: str) -> Rows:
         if not place:
             yield [column.head for column in sheet.columns]
         yield from sheet.rows
+
+
+def means(names: str) -> Rows:
+    """The steps of the entries that several studies share, a row for each study's task."""
+    outcomes = [published(name) for name in names.split("+")]
+    entries = [str(each.name) for each in outcomes[0].study.file.entries]
+    yield "task", "seeds", *entries
+    for outcome in outcomes:
+        times, seeds = outcome.mean_times(), sorted(set(outcome.looked.values()))
+        steps = (steps_text(times[entry].mean) for entry in entries)
+        yield f"`{outcome.study.task}`", " to ".join(map(str, seeds)), *steps
+
+
+OF_SEVERAL: dict[str, Callable[[str], Rows]] = {"together": together, "means": means}
 
 
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:
@@ -168,8 +187,8 @@ def filled(text: str) -> str:
 
     def table(found: re.Match[str]) -> str:
         name, kind = found.groups()
-        if kind == "together":
-            header, *rows = together(name)
+        if kind in OF_SEVERAL:
+            header, *rows = OF_SEVERAL[kind](name)
         elif kind in OF_BOARDS:
             header, *rows = OF_BOARDS[kind](name)
         else:
