@@ -48,7 +48,8 @@ def settings(outcome: StudyOutcome) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     tuned = [(str(each.name), each.tuning) for each in outcome.study.file.entries if each.tuning is not None]
     regrets = any(tuning.regret for _, tuning in tuned)
-    yield "entry", "parameters", "settings", "trials", *["expected regret"] * regrets, "M"
+    last = ("expected regret", "M in the search") if regrets else ("M",)
+    yield "entry", "parameters", "settings", "trials", *last
     for name, tuning in tuned:
         if tuning.value is None:  # the task's own settings
             continue
@@ -59,7 +60,7 @@ def settings(outcome: StudyOutcome) -> Rows:
             options = entry.model_options if side == "model" else entry.algorithm_options
             found.append(f"{own} {getattr(options, own):g}")
         parameters = str(sum(count_parameters(entry)))
-        regret = [f"{tuning.regret.expected:.0%}"] if tuning.regret else []
+        regret = [f"{tuning.regret.expected:.0%}"] if tuning.regret else [""] * regrets
         trials, steps = str(tuning.trials), steps_text(tuning.value)
         yield name.removesuffix(", tuned"), parameters, ", ".join(found), trials, *regret, steps
 
@@ -110,7 +111,8 @@ def means(names: str) -> Rows:
     for outcome in outcomes:
         times, seeds = outcome.mean_times(), sorted(set(outcome.looked.values()))
         steps = (steps_text(times[entry].mean) for entry in entries)
-        yield f"`{outcome.study.task}`", " to ".join(map(str, seeds)), *steps
+        counts = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+        yield f"`{outcome.study.task}`", counts, *steps
 
 
 OF_SEVERAL: dict[str, Callable[[str], Rows]] = {"together": together, "means": means}

@@ -83,24 +83,34 @@ def test_the_two_halves_of_the_seeds() -> None:
 
 
 def test_the_pairs_of_the_board_of_hydrogen() -> None:
-    text = " ".join(PAGE.partition("\n## Hydrogen\n")[2].partition("\n## ")[0].split())
+    rows = PAGE.partition("\n## Hydrogen\n")[2].partition("\n## ")[0].splitlines()
     [section] = api.board("vqe-h2", published=True, runs="none").sections
     board = section.as_dict()
     order = [row["entry"] for row in board["times"]["entries"]]
     named = {}
     for row in board["rows"]:
         words = row["label"].split()
-        name = "width " + words[2][6:] if "mlp" in words else "jerbi" if "ansatz=jerbi" in words else "iqp"
+        name = (
+            words[2].replace("=", " ")
+            if "mlp" in words
+            else "`jerbi`"
+            if "ansatz=jerbi" in words
+            else "`iqp`"
+        )
         control = next((word.partition("=")[2] for word in words if word.startswith("entangled=")), "")
         named[f"{name} {control}".strip()] = row
     assert len(named) == len(order) == 9
-    pairs = [(c, other) for other in ("width 6", "mean-field", "separable") for c in ("iqp", "jerbi")]
-    for first, other in (*pairs, ("width 16", "iqp"), ("width 64", "iqp")):
+    pairs = [(c, other) for c in ("`iqp`", "`jerbi`") for other in ("width 6", "mean-field", "separable")]
+    for first, other in (*pairs, ("`iqp`", "width 16"), ("`iqp`", "width 64")):
         one, two = named[first], named[other if other in named else f"{first} {other}"]
         compared = api.compare(one["label"], two["label"], task="vqe-h2", published=True, runs="none")
         found = re.search(r"needs ([\d.]+)% fewer .* \(([\d.]+)% to ([\d.]+)%", compared.verdict)
         assert found
         fewer, low, high = (f"{float(each):.0f}%" for each in found.groups())
         p = board["times"]["adjusted_p"][order.index(one["entry"])][order.index(two["entry"])]
-        said = f"{fewer} fewer{{}} ({low} to {high}) | {'decided' if p <= 0.05 else 'not told apart'} |"
-        assert said.format("") in text or said.format(" steps") in text
+        [row] = [row for row in rows if f"| {first} against {'its ' * (other not in named)}{other} " in row]
+        assert f" {fewer} fewer" in row
+        assert f" ({low} to {high}) | {'decided' if p <= 0.05 else 'not told apart'} |" in row
+        assert (f"{other} needs" in row) == (
+            two["label"].removeprefix("ddqn ") in compared.verdict.partition(" needs ")[0]
+        )

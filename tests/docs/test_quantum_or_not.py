@@ -111,7 +111,7 @@ def test_what_a_larger_batch_changes() -> None:
         pair = pairs[name, f"{name}, batch 64"]
         spans += [percent(value) for value in (pair.difference, *pair.interval)]
         assert 2 < pair.difference < 2.5
-    said = "tuned entries need {} more steps (6 qubits, {} to {}) and {} more (width 10, {} to {})"
+    said = "tuned entries of `quantum-or-not` need {} more steps (6 qubits, {} to {}) and {} more (width 10, {} to {})"
     assert said.format(*spans) in PROSE
     assert "both need about a third of the steps" in readme
     assert verdicts[circuit, network] == f"{circuit} needs fewer"
@@ -160,10 +160,19 @@ def test_one_size_on_several_tasks() -> None:
     found = said("beam6g", "network"), said("pulse", "network"), said("pulse", "sines")
     assert "needs {} more steps ({} to {}; to reach 0.9, {}, {} to {})".format(*found[0]) in PROSE
     assert "on `pulse` {} more ({} to {})".format(*found[1]) in PROSE
-    assert "on `pulse` by {} ({} to {}; to reach 0.98, {}, {} to {})".format(*found[2]) in PROSE
+    assert "on `pulse`: {} ({} to {}; to reach 0.98, {}, {} to {})".format(*found[2]) in PROSE
     assert "`beam6g` (+{}, {} to {})".format(*said("beam6g", "sines")) in PROSE
     fewer, high, low = (number.removeprefix("-") for number in said("vqe-h2", "sines")[:3])
     assert f"they need {fewer} fewer steps than the circuit ({low} to {high})" in PROSE
+
+
+def test_the_mean_over_tasks_decides_nothing() -> None:
+    names = "equal-size-beam6g+equal-size-beam6g-degree5+equal-size-vqe-h2+equal-size-pulse"
+    _, network, *others = tables.together(names)
+    assert {row[1] for row in (network, *others)} == {"not told apart"}
+    mean, low, high = re.findall(r"[\d.]+%", network[2])
+    p = network[3].removeprefix("0")
+    assert f"needs {mean} more steps than the circuit ({low} to {high} by itself, p {p} over" in PROSE
 
 
 def test_the_hours_of_the_searches_of_one_size() -> None:
