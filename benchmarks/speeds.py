@@ -56,7 +56,12 @@ CARTPOLE = [
     ("cartpole", "ppo", "mlp", {"width": 64, "depth": 2}, 20),
     ("cartpole", "ddqn", "mlp", {"width": 64, "depth": 2}, 20),
 ]
-ENTRIES = WIDTHS + DEPTHS + CIRCUITS + DEEPER + ON_POLICY + CARTPOLE
+VQE = [
+    ("vqe-h2", "ddqn", "mlp", {"width": 16, "depth": 2}, 50),
+    ("vqe-h2", "ddqn", "mlp", {"width": 64, "depth": 2}, 50),
+    ("vqe-h2", "ddqn", "vqc-native", {"model.qubits": 4, "layers": 4}, 50),
+]
+ENTRIES = WIDTHS + DEPTHS + CIRCUITS + DEEPER + ON_POLICY + CARTPOLE + VQE
 
 Row = dict[str, Any]
 
@@ -71,7 +76,7 @@ def measure(task: str, algorithm: str, model: str, options: dict[str, int], seed
         "environment": entry.task.environment.name,
         "algorithm": algorithm,
         "model": model,
-        "options": options,
+        "options": {name.removeprefix("model."): value for name, value in options.items()},
         "seconds": float(f"{together:.2g}"),
         "group": seeds,
         "alone": float(f"{alone:.2g}"),

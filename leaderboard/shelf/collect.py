@@ -154,7 +154,7 @@ def select(
     Raises
     ------
     OptionError
-        If the horizon is no whole number of epochs of a task.
+        If the horizon is a whole number of epochs of none of the tasks.
     UnknownNameError
         If none or several entries match a name, or none is left.
     """
@@ -171,15 +171,12 @@ def select(
         entries = [entry for entry in entries if not tasks or entry.task in tasks]
     else:
         left_out = [line for entry in entries for line in entry.refused]
+    if horizon is not None:
+        entries, uneven = _at_whole_epochs(entries, horizon)
+        left_out += uneven
     n_read = len(entries)
     kept = []
     for entry in entries:
-        if horizon is not None and (horizon < 1 or horizon % entry.steps_per_epoch):
-            epochs = max(1, round(horizon / entry.steps_per_epoch))
-            raise OptionError(
-                f"--horizon {horizon}: an epoch of task '{entry.task}' has {entry.steps_per_epoch} steps; write a "
-                f"multiple of it, such as --horizon {epochs * entry.steps_per_epoch}"
-            )
         reached = entry if horizon is None else entry.cut(horizon // entry.steps_per_epoch)
         if reached is None:
             left_out.append(
@@ -190,6 +187,24 @@ def select(
     if n_read and not kept:
         raise UnknownNameError(f"no entry is left: {'; '.join(left_out[-n_read:])}")
     return kept, left_out
+
+
+def _at_whole_epochs(entries: Sequence[EntryResults], horizon: int) -> tuple[list[EntryResults], list[str]]:
+    """Leave out the tasks of which a horizon is no whole number of epochs; an error where that leaves none."""
+    whole, lines = [], dict[str, str]()
+    for entry in entries:
+        steps = entry.steps_per_epoch
+        if horizon >= 1 and horizon % steps == 0:
+            whole.append(entry)
+            continue
+        epochs = max(1, round(horizon / steps))
+        lines[entry.task] = (
+            f"--horizon {horizon}: an epoch of task '{entry.task}' has {steps} steps; write a multiple of it, such as "
+            f"--horizon {epochs * steps}"
+        )
+    if lines and not whole:
+        raise OptionError(next(iter(lines.values())))
+    return whole, list(lines.values())
 
 
 def equally_long(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
