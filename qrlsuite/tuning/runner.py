@@ -64,7 +64,7 @@ def run(
     """Run trials, then write the preset file of each search that has a best trial and waits for none.
 
     No trials are begun that would not end within the requests' budget of time, one after the other and at the pace of
-    those before.
+    those before. Trials that an earlier call finished cost no time.
 
     Parameters
     ----------
@@ -121,12 +121,12 @@ def _run(
                 display.console.print(outcome.submitted, markup=False)
         return [work.store for work in works]
 
-    began = time.monotonic()
+    spent = 0.0  # seconds in steps that trained; trials of an earlier call cost no budget
     pace: dict[int, float] = {}  # seconds per run of each search
     while turn := [(i, search) for i, search in enumerate(searches) if not search.over]:
         most = None
         if budget is not None:
-            left = budget - (time.monotonic() - began)
+            left = budget - spent
             one_each = sum(pace.get(i, 0.0) * search.next_seeds for i, search in turn)
             if left < one_each:
                 return False
@@ -138,5 +138,7 @@ def _run(
                 display.told(search, trial)
             display.regret(search)
             if trained > before:
-                pace[i] = (time.monotonic() - started) / (trained - before)
+                took = time.monotonic() - started
+                spent += took
+                pace[i] = took / (trained - before)
     return not any(search.pending for search in searches)

@@ -99,9 +99,13 @@ def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path)
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     first = say(*words, "--budget", "0.01s").stdout
     assert "the budget is spent, 2 trials are left" in first, "after the first trial, no other fits"
+    again = say(*words, "--budget", "0.01s").stdout
+    assert "the budget is spent, 1 trial" in again, "the finished trial costs nothing, and one more is trained"
     rest = say(*words, "--budget", "1h").stdout
     assert "the budget is spent" not in rest
     assert "wrote " in rest
+    repeated = say(*words, "--budget", "0.01s").stdout
+    assert "the budget is spent" not in repeated, "no finished trial is left out of the preset"
 
 
 def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(tiny_task: str, tmp_path: Path) -> None:
