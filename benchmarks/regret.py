@@ -36,7 +36,9 @@ FIRST_SEED = 1_100_000
 SEEDS = 200
 
 
-def searched(task: str, model: str, runs: Path, sampler: str = "bayesian", seeds: int | None = None) -> Search:
+def searched(
+    task: str, model: str, runs: Path, sampler: str = "bayesian", seeds: int | None = None
+) -> Search:
     """Return a finished search."""
     runs.mkdir(parents=True, exist_ok=True)
     varied = runs / "varied.toml"

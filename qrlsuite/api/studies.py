@@ -101,7 +101,8 @@ def new_study(
     path:
         The file, NAME.toml. It names the plugins by path of its entries, and can be edited until its first seed begins.
     entries:
-        Two or more: `"mlp width=64"`, `"vqc-native qubits=10"`; tuned: `"mlp preset=FILE.toml"`.
+        Two or more: `"mlp width=64"`, `"vqc-native qubits=10"`; tuned: `"mlp preset=FILE.toml"`; with a name:
+        `"wide: mlp width=64"`.
     task, epochs:
         As for `train`.
     looks:

@@ -410,8 +410,9 @@ def new(
     Parameters
     ----------
     entries:
-        Each as `[ALGORITHM] MODEL NAME=VALUE ...`. A setting `preset=FILE.toml` gives the values of a preset file, with
-        the record of how they were found.
+        Each as `[ALGORITHM] MODEL NAME=VALUE ...`, with a name before it where one is wanted, `wide, tuned: mlp
+        preset=FILE.toml`. A setting `preset=FILE.toml` gives the values of a preset file, with the record of how they
+        were found.
     first_seed:
         None for the first block from 10,000 of which no seed was trained below `runs`.
     looks:
@@ -431,7 +432,10 @@ def new(
             name=name,
             summary=question_of([]),
             looks=LooksSection(**{key: value for key, value in looks.items() if value is not None}),
-            entries=[EntriesSection(task=task, model=text) for text in entries],
+            entries=[
+                EntriesSection(task=task, model=text, name=name or None)
+                for name, text in map(_named, entries)
+            ],
         )
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(files.problems(error, StudyFile))) from None
@@ -441,11 +445,24 @@ def new(
         study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
     names, shared = _brief(list(study.entries))
     if shared:
-        tables = [table.model_copy(update={"name": name}) for table, name in zip(study.file.entries, names)]
+        tables = [
+            table.model_copy(update={"name": table.name or name})
+            for table, name in zip(study.file.entries, names)
+        ]
         study = StudyWithLooks(Study(study.file.model_copy(update={"entries": tables}), "the study"), runs)
     summary = question_of(names) + (f" All have {' '.join(shared)}." if shared else "")
     study.file = study.file.model_copy(update={"summary": summary})
     return study
+
+
+def _named(text: str) -> tuple[str, str]:
+    """Return the name that is written before an entry, `wide: mlp width=64`, or an empty one; and the entry.
+
+    >>> _named("wide, tuned: mlp preset=wide.toml"), _named("mlp width=64")
+    (('wide, tuned', 'mlp preset=wide.toml'), ('', 'mlp width=64'))
+    """
+    name, colon, entry = text.partition(": ")
+    return (name.strip(), entry.strip()) if colon else ("", text)
 
 
 def _brief(names: Sequence[str]) -> tuple[list[str], list[str]]:

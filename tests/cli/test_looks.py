@@ -264,6 +264,21 @@ def test_python_compares_as_the_command_does() -> None:
         api.new_study("widths.toml", ["mlp", "mlp width=8"], task="tiny.toml")
 
 
+def test_entries_are_named_where_they_are_written() -> None:
+    words = ["wide, tuned: mlp width=16", "mlp width=8", "small: mlp width=4"]
+    written = api.new_study("widths.toml", words, task="tiny.toml")
+    assert {pair.first for pair in written.pairs} == {"wide, tuned", "mlp width=8"}
+    assert {pair.second for pair in written.pairs} == {"mlp width=8", "small"}
+    assert "Which needs fewer steps, wide, tuned, mlp width=8 or small?" in Path("widths.toml").read_text()
+    assert api.read_study("widths.toml").study.hash == written.study.hash
+    for name, problem in (("a: b", "unknown algorithm 'b:'"), ("wide; tuned", "name = 'wide; tuned'")):
+        with pytest.raises(QrlSuiteError, match=problem):
+            api.new_study("others.toml", [f"{name}: mlp width=16", "mlp width=8"], task="tiny.toml")
+    with pytest.raises(QrlSuiteError, match="two groups are named 'wide'"):
+        api.new_study("others.toml", ["wide: mlp width=16", "wide: mlp width=8"], task="tiny.toml")
+    assert not Path("others.toml").exists()
+
+
 def test_a_killed_worker_changes_no_byte(hold: Hold) -> None:
     Path("tiny.toml").write_text(TINY)
     write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2 reason=test")

@@ -100,7 +100,9 @@ def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path)
     first = say(*words, "--budget", "0.01s").stdout
     assert "the budget is spent, 2 trials are left" in first, "after the first trial, no other fits"
     again = say(*words, "--budget", "0.01s").stdout
-    assert "the budget is spent, 1 trial" in again, "the finished trial costs nothing, and one more is trained"
+    assert "the budget is spent, 1 trial" in again, (
+        "the finished trial costs nothing, and one more is trained"
+    )
     rest = say(*words, "--budget", "1h").stdout
     assert "the budget is spent" not in rest
     assert "wrote " in rest

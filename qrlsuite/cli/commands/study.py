@@ -74,7 +74,8 @@ def new(
         list[str],
         typer.Argument(
             metavar="ENTRY ENTRY ...",
-            help="Two or more: 'mlp width=64' 'vqc-native qubits=10'; tuned: 'mlp preset=FILE.toml'.",
+            help="Two or more: 'mlp width=64' 'vqc-native qubits=10'; tuned: 'mlp preset=FILE.toml'; "
+            "with a name: 'wide: mlp width=64'.",
         ),
     ],
     task: Annotated[
