@@ -23,6 +23,7 @@ from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.runner import PendingEntry
 from qrlsuite.studies.study import Member, PictureSection, Study, load
+from qrlsuite.studies.together import StudiesTogether
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -329,6 +330,19 @@ def draw_outcome(outcome: StudyOutcome) -> list[Drawn]:
     own = draw(study, study.members(), outcome.study.folder) if study.file.pictures else []
     figures = {"pairs": drawing.draw(outcome), "entries": drawing.draw_entries(outcome)}
     return [*(Drawn(name, name, (), figure=figure) for name, figure in figures.items()), *own]
+
+
+def draw_together(together: StudiesTogether) -> list[Drawn]:
+    """Draw the pairs that several studies with looks compare, task by task.
+
+    Raises
+    ------
+    OptionError
+        If no pair has a mean over the tasks.
+    """
+    from qrlsuite.leaderboard.pictures import outcome as drawing
+
+    return [Drawn("tasks", "tasks", (), figure=drawing.draw_together(together))]
 
 
 def write(name: str, pictures_: Iterable[Drawn], runs: Path, format_: str) -> list[Drawn]:

@@ -1,7 +1,8 @@
-"""A study with looks: its pairs, with intervals and verdicts, or its entries by mean time below threshold."""
+"""A study with looks: its pairs, with intervals and verdicts, or its entries by mean time; several: pairs by task."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from qrlsuite.results.text import steps_text
 from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.studies import outcome as outcomes
 from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.together import StudiesTogether
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,29 +63,18 @@ def draw(outcome: StudyOutcome) -> Figure:
     for height, row in enumerate(rows):
         if isinstance(row, PairDecision):
             ends += _row(axes, height, row)
-    low, high = min(ends) / 1.1, max(ends) * 1.1
     margin = study.looks.margin
-    axes.axvspan(1 / (1 + margin), 1 + margin, color="#000000", alpha=0.07, lw=0)
-    axes.axvline(1, color="#404040", lw=0.8)
-    axes.set_xscale("log")
-    axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(
-        FuncFormatter(lambda ratio, _: outcomes.percent(ratio - 1) if ratio != 1 else "0")
-    )
+    _ratios(axes, ends, margin)
     axes.set_xlabel(f"pair A / B: how much longer B is {study.grid.before} the thresholds than A")
     _name_rows(axes, names)
     for tick, row in zip(axes.get_yticklabels(), rows):
         if not isinstance(row, PairDecision):
             tick.set_fontweight("bold")
-    for each, (label, color, marker) in LOOKS.items():
-        if any(pair.decided is each for pair in decision.pairs):
-            axes.plot([], [], marker, color=color, label=label, ls="none")
+    _legend(axes, decision.pairs)
     confidence = 100 * (1 - study.looks.alpha)
     _finish(
         figure,
-        outcome,
+        f"{study.task}: {study.name}",
         f"repeated confidence intervals: they hold at every look, {confidence:g} percent for all "
         f"{len(decision.pairs)} pairs together",
         "a verdict is decided at any threshold, the interval is that of their mean",
@@ -134,13 +125,103 @@ def draw_entries(outcome: StudyOutcome) -> Figure:
         axes.plot([], [], look.marker, color=look.color, label=style.plain(model), ls="none")
     _finish(
         figure,
-        outcome,
+        f"{study.task}: {study.name}",
         "M: mean over seeds and the task's thresholds, with 95 percent intervals of each entry alone",
         "filled: with settings that tuning found" if tuned else "",
         "right: seeds at the last look",
         "an early stop can over- or understate M; verdicts compare pairs at equal seeds",
     )
     return figure
+
+
+def draw_together(together: StudiesTogether) -> Figure:
+    """Draw a row for each task below each pair that all studies compare, and the mean over the tasks.
+
+    The axis is that of `draw`. A task's row has the verdict, interval and seeds of its own study; the mean is that of
+    `StudiesTogether`.
+
+    Raises
+    ------
+    OptionError
+        If no pair has a mean over the tasks.
+    """
+    if not together.pairs:
+        raise OptionError(f"no pair has a mean over the tasks: {'; '.join(together.left_out)}")
+    studies = together.studies
+    found = [{(pair.first, pair.second): pair for pair in each.pairs} for each in studies]
+    height = 1.4 + 0.25 * len(together.pairs) * (len(studies) + 2)
+    figure = Figure(figsize=(9.5, height), layout="constrained")
+    axes = figure.subplots()
+    names: list[str] = []
+    heads, ends, shown = [], [1.0], []
+    for shared in together.pairs:
+        heads.append(len(names))
+        names.append(f"{shared.first} / {shared.second}")
+        for task, pairs in zip(together.tasks, found):
+            pair = pairs.get((shared.first, shared.second)) or _reversed(pairs[shared.second, shared.first])
+            ends += _row(axes, len(names), pair)
+            shown.append(pair)
+            names.append(task)
+        ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *shared.ratio.interval))
+        axes.plot([low, high], [len(names)] * 2, color="black", lw=1.6)
+        axes.plot([ratio], [len(names)], "*", color="black", ms=9)
+        ends += [low, high]
+        names.append(f"mean of {len(studies)} tasks: {shared.verdict}")
+    margins = {each.study.looks.margin for each in studies}
+    _ratios(axes, ends, margins.pop() if len(margins) == 1 else 0.0)
+    axes.set_xlabel("pair A / B: how many more steps B needs than A (on the right, A is ahead)")
+    _name_rows(axes, names)
+    for head in heads:
+        axes.get_yticklabels()[head].set_fontweight("bold")
+    _legend(axes, shown)
+    axes.plot([], [], "*", color="black", ms=9, label="mean over the tasks")
+    _finish(
+        figure,
+        f"{len(studies)} tasks: {studies[0].study.name} and {len(studies) - 1} more",
+        "tasks: each study's verdicts and repeated confidence intervals, which hold for all of its pairs and looks; "
+        "right: seeds of each entry at the pair's last look",
+        "a verdict is decided at any threshold, the interval is that of their mean; an early stop overstates the "
+        "difference",
+        "mean: of the ratios, by the first look's seeds of each study, with a 95 percent interval by itself; the "
+        "verdict holds for all pairs",
+        f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, shown)) else "",
+    )
+    return figure
+
+
+def _reversed(pair: PairDecision) -> PairDecision:
+    """Return a pair with its entries exchanged."""
+    decided = {Decided.FIRST: Decided.SECOND, Decided.SECOND: Decided.FIRST}
+    low, high = pair.interval
+    return dataclasses.replace(
+        pair,
+        first=pair.second,
+        second=pair.first,
+        difference=1 / (1 + pair.difference) - 1,
+        interval=(1 / (1 + high) - 1, 1 / (1 + low) - 1),
+        decided=pair.decided and decided.get(pair.decided, pair.decided),
+    )
+
+
+def _ratios(axes: Axes, ends: Sequence[float], margin: float) -> None:
+    """Make the axis one of ratios, wide enough for all that was drawn, with the margin shaded."""
+    low, high = min(ends) / 1.1, max(ends) * 1.1
+    axes.axvspan(1 / (1 + margin), 1 + margin, color="#000000", alpha=0.07, lw=0)
+    axes.axvline(1, color="#404040", lw=0.8)
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(
+        FuncFormatter(lambda ratio, _: outcomes.percent(ratio - 1) if ratio != 1 else "0")
+    )
+
+
+def _legend(axes: Axes, pairs: Sequence[PairDecision]) -> None:
+    """Name what was decided of the pairs."""
+    for each, (label, color, marker) in LOOKS.items():
+        if any(pair.decided is each for pair in pairs):
+            axes.plot([], [], marker, color=color, label=label, ls="none")
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -168,16 +249,20 @@ def _at_right(axes: Axes, height: int, text: str) -> None:
     )
 
 
-def _finish(figure: Figure, outcome: StudyOutcome, *footnotes: str) -> None:
+def _finish(figure: Figure, title: str, *footnotes: str) -> None:
     """Add legend, title and remarks."""
     figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
-    task = outcome.study.task
-    figure.suptitle(style.plain(f"{task}: {outcome.study.name}"), x=0.01, ha="left", fontsize="medium")
+    figure.suptitle(style.plain(title), x=0.01, ha="left", fontsize="medium")
     style.footnotes(figure, *footnotes)
 
 
 def _cut(pair: PairDecision) -> bool:
     return bool(pair.p) and not all(WIDEST[0] <= 1 + end <= WIDEST[1] for end in pair.interval)
+
+
+def _within(ratio: float) -> float:
+    """Return a ratio, cut at the axis' ends."""
+    return min(max(ratio, WIDEST[0]), WIDEST[1])
 
 
 def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
@@ -186,7 +271,7 @@ def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
         text = "both mean times are 0" if pair.p else "no look yet"
         axes.annotate(text, (1, height), fontsize=8, va="center")
         return []
-    ratio, low, high = (min(max(1 + end, WIDEST[0]), WIDEST[1]) for end in (pair.difference, *pair.interval))
+    ratio, low, high = (_within(1 + end) for end in (pair.difference, *pair.interval))
     _, color, marker = LOOKS[pair.decided]
     axes.plot([low, high], [height, height], color=color, lw=1.6)
     axes.plot([ratio], [height], marker, color=color, ms=5.5)

@@ -279,7 +279,7 @@ def run_study(
 
 def draw_study(
     name: str,
-    *,
+    *more: str,
     options: Mapping[str, Any] | None = None,
     models: Mapping[str, str] | None = None,
     only: str | Sequence[str] = (),
@@ -294,6 +294,8 @@ def draw_study(
     ----------
     name, options, models, only, format, runs:
         As for `run_study`.
+    more:
+        Further studies with looks, each of another task: then the pairs that all of them compare are drawn together.
     seeds:
         Of every entry these alone; None takes all that are finished.
     published:
@@ -306,18 +308,21 @@ def draw_study(
     """
     check_format(format)
     study, folder = studies.find(name), Path(runs)
-    if study.file.looks is not None:
+    if study.file.looks is not None or more:
         require_unchanged(name, {"options": options, "models": models, "only": only, "--seeds": seeds})
-        pictures = studies.draw_outcome(studies.read_outcome(name, folder))
+        outcomes = tuple(_outcome(each, folder) for each in (name, *more))
+        pictures = (
+            studies.draw_together(StudiesTogether(outcomes)) if more else studies.draw_outcome(outcomes[0])
+        )
     else:
         members = study_runner.select(study, from_mapping(options), models, several(only))
         pictures = studies.draw(study, members, folder, with_published=published, seeds=seeds)
     drawn = studies.write(study.name, pictures, folder, format)
     if not any(each.path for each in drawn):
         reasons = sorted({each.problem for each in drawn})
-        more = "" if published else "; --published draws the entries that come with the suite"
+        hint = "" if published else "; --published draws the entries that come with the suite"
         raise OptionError(
-            f"study '{study.name}' has no picture yet: {'; '.join(reasons)}: qrlsuite study run {name}{more}"
+            f"study '{study.name}' has no picture yet: {'; '.join(reasons)}: qrlsuite study run {name}{hint}"
         )
     return study, drawn
 

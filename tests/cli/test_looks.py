@@ -747,6 +747,35 @@ def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
     assert "neither had the time to learn" in page.note
 
 
+def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path) -> None:
+    told = answer("study", "draw", *TOGETHER, "--runs", str(tmp_path))
+    assert [picture["picture"] for picture in told["pictures"]] == ["tasks"]
+    assert (tmp_path / "study-quantum-or-not-tasks.png").read_bytes().startswith(b"\x89PNG")
+    read = api.read_study(*TOGETHER)
+    assert isinstance(read, together.StudiesTogether)
+    [axes] = drawing.draw_together(read).axes
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}
+    size = len(TOGETHER) + 2
+    assert len(names) == size * len(read.pairs)
+    for place, shared in enumerate(read.pairs):
+        head, *tasks, mean = names[place * size : (place + 1) * size]
+        assert head == f"{shared.first} / {shared.second}"
+        assert tuple(tasks) == read.tasks
+        assert mean == f"mean of 3 tasks: {shared.verdict}"
+        own = [
+            pair.interval
+            for study in read.studies
+            for pair in study.pairs
+            if (pair.first, pair.second) == (shared.first, shared.second)
+        ]
+        for row, interval in enumerate((*own, shared.ratio.interval), start=place * size + 1):
+            assert lines[row].get_xdata() == pytest.approx([1 + end for end in interval])
+    turned = drawing._reversed(drawing._reversed(read.studies[0].pairs[0]))
+    assert turned.interval == pytest.approx(read.studies[0].pairs[0].interval)
+    assert drawing._reversed(turned).decided is not turned.decided
+
+
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:
     write()
     for names, said in (

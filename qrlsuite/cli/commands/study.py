@@ -195,16 +195,20 @@ def draw(
     """Draw a study's pictures from finished seeds; trains nothing.
 
     The sample complexity of few seeds is another quantity than that of many: --seeds 20 draws equal numbers. Of a study
-    with looks, every pair is drawn below its question, and every entry by its steps below threshold.
+    with looks, every pair is drawn below its question, and every entry by its steps below threshold; of several, each
+    of another task, the pairs that all of them compare, task by task.
 
-    Example: qrlsuite study draw degree --published --seeds 20 --format pdf
+    Examples: qrlsuite study draw degree --published --seeds 20 --format pdf; qrlsuite study draw
+    quantum-or-not-degree5 quantum-or-not-a3-0
     """
     options, models, only = _changes(words)
+    more = only if studies.find(name).file.looks is not None else []
     study, drawn = draw_study(
         name,
+        *more,
         options=options,
         models=models,
-        only=only,
+        only=[] if more else only,
         seeds=seeds,
         format=format_,
         runs=runs,
