@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Literal
 
 from qrlsuite.errors import StoreError
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, cause
 
 HEARTBEAT = 5.0
 """Seconds between two refreshes of a claim."""
@@ -267,7 +267,7 @@ def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Cla
             held = {seed: holder for holder in holders for seed in holder.seeds}
             return [_acquire_free(store, seeds, held) for seeds in groups]
     except OSError as error:
-        raise StoreError(f"cannot write {store.claims}: {error.strerror or error}") from None
+        raise StoreError(f"cannot write {store.claims}: {cause(error)}") from None
 
 
 def _acquire_free(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from qrlsuite.errors import StoreError
-from qrlsuite.results.store import EntryStore, write_atomically
+from qrlsuite.results.store import EntryStore, cause, write_atomically
 
 
 @dataclass
@@ -94,7 +94,7 @@ class ProgressFile:
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
-            raise StoreError(f"cannot write {self.path}: {error.strerror or error}") from None
+            raise StoreError(f"cannot write {self.path}: {cause(error)}") from None
 
 
 def read_progress(path: Path) -> dict[str, Any]:

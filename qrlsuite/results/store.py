@@ -18,6 +18,7 @@ and a torn last line is dropped. Nothing is ever pickled.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import itertools
 import json
@@ -78,9 +79,14 @@ def write_atomically(path: Path, content: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise StoreError(
-            f"cannot write {path}: {error.strerror or error}; the old file is unchanged"
-        ) from None
+        raise StoreError(f"cannot write {path}: {cause(error)}; the old file is unchanged") from None
+
+
+def cause(error: OSError) -> str:
+    """Say why a file could not be written, and on a full disk what frees some of it."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    hint = " (`qrlsuite runs gc` frees what finished seeds keep to be extended)"
+    return f"{error.strerror or error}{hint * full}"
 
 
 def _umask() -> int:
@@ -220,7 +226,7 @@ def append(path: Path, content: bytes) -> None:
         with path.open("ab") as file:
             file.write(content)
     except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from None
+        raise StoreError(f"cannot write {path}: {cause(error)}") from None
 
 
 def shortest(values: NDArray[Any]) -> list[float]:

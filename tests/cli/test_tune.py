@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 from pathlib import Path
 
@@ -108,6 +109,22 @@ def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path)
     assert "wrote " in rest
     repeated = say(*words, "--budget", "0.01s").stdout
     assert "the budget is spent" not in repeated, "no finished trial is left out of the preset"
+
+
+def test_what_trials_keep_is_said_and_can_be_freed(
+    tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("qrlsuite.cli.commands.tune.MUCH", 1)
+    words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3"]
+    words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
+    line = say(*words).stdout.splitlines()[-1]
+    assert re.match(r"trials keep [\d.]+ kB so that they can be extended by more epochs; to free it: ", line)
+    freed = say(*shlex.split(line.partition("to free it: ")[2])[1:]).stdout
+    assert freed.count("  (seeds 1000000:1000001)") == 2
+    assert "freed" in freed
+    again = say(*words).stdout
+    assert "wrote " in again, "the trials' curves are still there"
+    assert "trials keep" not in again
 
 
 def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(tiny_task: str, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from qrlsuite.api.tables import progress_table
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption, entries_here
 from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.status import EntryStatus, choose, delete_each, survey
-from qrlsuite.engine.terminal import printable, table_console
+from qrlsuite.engine.terminal import command, printable, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds
@@ -109,7 +109,8 @@ def collect_garbage(
         return
     typer.echo(
         f"would remove {len(items)} checkpoint{'s' * (len(items) > 1)}, {size_text(total)}. Curves and trained agents "
-        "stay, but these seeds can then not be extended by more epochs. To do it: qrlsuite runs gc --yes"
+        "stay, but these seeds can then not be extended by more epochs. To do it: "
+        + command("runs", "gc", *(["--task", task] if task else []), "--yes", runs=runs)
     )
 
 

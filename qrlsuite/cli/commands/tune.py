@@ -23,11 +23,14 @@ from qrlsuite.cli.training import (
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.notation import write_setting
-from qrlsuite.results.text import hours_text
-from qrlsuite.tuning.search import Search
+from qrlsuite.results.survey import garbage
+from qrlsuite.results.text import hours_text, size_text
+from qrlsuite.tuning.search import FOLDER, Search
 
 LARGE = 200
 """Trials from which a search without a budget has to be asked for twice."""
+MUCH = 1_000_000_000
+"""Bytes of checkpoints from which a search says how to free them."""
 
 
 class Goal(StrEnum):
@@ -188,3 +191,11 @@ def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
         words = [each.base.model.name, write_setting("preset", str(each.written))]
         line = command("run", *words, "--task", each.request.task, runs=runs)
         wide.print(f"next: {line}", markup=False, soft_wrap=True)
+    kept = sum(item.size for item in garbage(runs / FOLDER, searches[0].base.task.name)[0])
+    if kept >= MUCH:
+        line = command("runs", "gc", "--yes", runs=runs / FOLDER)
+        wide.print(
+            f"trials keep {size_text(kept)} so that they can be extended by more epochs; to free it: {line}",
+            markup=False,
+            soft_wrap=True,
+        )
