@@ -31,7 +31,6 @@ ROOT = Path(__file__).parents[1]
 PAGES = [
     ROOT / page
     for page in (
-        "README.md",
         "docs/fidelity.md",
         "docs/leaderboard.md",
         "docs/plans.md",
