@@ -56,12 +56,16 @@ CARTPOLE = [
     ("cartpole", "ppo", "mlp", {"width": 64, "depth": 2}, 20),
     ("cartpole", "ddqn", "mlp", {"width": 64, "depth": 2}, 20),
 ]
-VQE = [
-    ("vqe-h2", "ddqn", "mlp", {"width": 16, "depth": 2}, 50),
-    ("vqe-h2", "ddqn", "mlp", {"width": 64, "depth": 2}, 50),
-    ("vqe-h2", "ddqn", "vqc-native", {"model.qubits": 4, "layers": 4}, 50),
+SMALL_CIRCUITS = [
+    (task, "ddqn", model, options, 50)
+    for task in ("vqe-h2", "pulse")
+    for model, options in (
+        ("mlp", {"width": 16, "depth": 2}),
+        ("mlp", {"width": 64, "depth": 2}),
+        ("vqc-native", {"model.qubits": 4, "layers": 4}),
+    )
 ]
-ENTRIES = WIDTHS + DEPTHS + CIRCUITS + DEEPER + ON_POLICY + CARTPOLE + VQE
+ENTRIES = WIDTHS + DEPTHS + CIRCUITS + DEEPER + ON_POLICY + CARTPOLE + SMALL_CIRCUITS
 
 Row = dict[str, Any]
 

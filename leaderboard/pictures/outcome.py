@@ -168,7 +168,8 @@ def draw_together(together: StudiesTogether) -> Figure:
         ends += [low, high]
         names.append(f"mean of {len(studies)} tasks: {shared.verdict}")
     margins = {each.study.looks.margin for each in studies}
-    _ratios(axes, ends, margins.pop() if len(margins) == 1 else 0.0)
+    shade = margins.pop() if len(margins) == 1 else None
+    _ratios(axes, ends, shade or 0.0)
     axes.set_xlabel("pair A / B: how many more steps B needs than A (on the right, A is ahead)")
     _name_rows(axes, names)
     for head in heads:
@@ -180,10 +181,12 @@ def draw_together(together: StudiesTogether) -> Figure:
         f"{len(studies)} tasks: {studies[0].study.name} and {len(studies) - 1} more",
         "tasks: each study's verdicts and repeated confidence intervals, which hold for all of its pairs and looks; "
         "right: seeds of each entry at the pair's last look",
-        "a verdict is decided at any threshold, the interval is that of their mean; an early stop overstates the "
-        "difference",
+        "a verdict is decided at any threshold, the interval is that of their mean; equality is tested for each pair "
+        "by itself; an early stop overstates the difference",
         "mean: of the ratios, by the first look's seeds of each study, with a 95 percent interval by itself; the "
         "verdict holds for all pairs",
+        "" if shade is None else f"shaded: equal within {100 * shade:g} percent",
+        *(f"left out: {line}" for line in together.left_out),
         f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, shown)) else "",
     )
     return figure

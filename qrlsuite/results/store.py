@@ -85,7 +85,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 def cause(error: OSError) -> str:
     """Say why a file could not be written, and on a full disk what frees some of it."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    hint = " (`qrlsuite runs gc` frees what finished seeds keep to be extended)"
+    hint = " (to free some: qrlsuite runs gc --runs DIR, and DIR/tuning of searches)"
     return f"{error.strerror or error}{hint * full}"
 
 

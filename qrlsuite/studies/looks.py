@@ -443,12 +443,11 @@ def new(
     while first_seed is None and study.trained_before():
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
-    names, shared = _brief(list(study.entries))
+    names, shared = list(study.entries), []
+    if not any(table.name for table in study.file.entries):  # names that were written stay as they are
+        names, shared = _brief(names)
     if shared:
-        tables = [
-            table.model_copy(update={"name": table.name or name})
-            for table, name in zip(study.file.entries, names)
-        ]
+        tables = [table.model_copy(update={"name": name}) for table, name in zip(study.file.entries, names)]
         study = StudyWithLooks(Study(study.file.model_copy(update={"entries": tables}), "the study"), runs)
     summary = question_of(names) + (f" All have {' '.join(shared)}." if shared else "")
     study.file = study.file.model_copy(update={"summary": summary})

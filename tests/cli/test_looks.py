@@ -31,6 +31,7 @@ from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
+from qrlsuite.statistics.sequential import Decided
 from qrlsuite.studies import together
 from qrlsuite.studies.outcome import needs_text
 from tests.commands import answer, qrlsuite, say, start
@@ -771,9 +772,12 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
         ]
         for row, interval in enumerate((*own, shared.ratio.interval), start=place * size + 1):
             assert lines[row].get_xdata() == pytest.approx([1 + end for end in interval])
-    turned = drawing._reversed(drawing._reversed(read.studies[0].pairs[0]))
-    assert turned.interval == pytest.approx(read.studies[0].pairs[0].interval)
-    assert drawing._reversed(turned).decided is not turned.decided
+    pair = next(each for each in read.studies[0].pairs if each.decided is Decided.FIRST)
+    turned = drawing._reversed(pair)
+    assert (turned.first, turned.second) == (pair.second, pair.first)
+    assert turned.decided is Decided.SECOND
+    ratios = [1 / (1 + each) - 1 for each in (pair.difference, *reversed(pair.interval))]
+    assert [turned.difference, *turned.interval] == pytest.approx(ratios)
 
 
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:

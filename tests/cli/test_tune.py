@@ -99,9 +99,9 @@ def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path)
     words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3,1e-4"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     first = say(*words, "--budget", "0.01s").stdout
-    assert "the budget is spent, 2 trials are left" in first, "after the first trial, no other fits"
+    assert "the budget is spent, 2 trials left" in first, "after the first trial, no other fits"
     again = say(*words, "--budget", "0.01s").stdout
-    assert "the budget is spent, 1 trial" in again, (
+    assert "the budget is spent, 1 trial left" in again, (
         "the finished trial costs nothing, and one more is trained"
     )
     rest = say(*words, "--budget", "1h").stdout

@@ -50,7 +50,7 @@ def test_a_full_disk(disk: Path, words: list[str], train: Train) -> None:
     assert full.returncode == 2
     assert "finished epochs are kept" in only_line(full)
     assert "No space left on device" in only_line(full)
-    assert "`qrlsuite runs gc` frees" in only_line(full)
+    assert "to free some: qrlsuite runs gc --runs DIR" in only_line(full)
     for command in ("runs", "leaderboard"):
         assert say(command, "--runs", str(disk / "runs")).exit_code == 0
     remount(disk, "size=20m")

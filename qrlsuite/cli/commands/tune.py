@@ -24,7 +24,7 @@ from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.notation import write_setting
 from qrlsuite.results.survey import garbage
-from qrlsuite.results.text import hours_text, size_text
+from qrlsuite.results.text import counted, hours_text, size_text
 from qrlsuite.tuning.search import FOLDER, Search
 
 LARGE = 200
@@ -183,17 +183,18 @@ def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
             f"{waiting} trials wait for other processes or a queue: repeat this command when they have ended"
         )
     elif not complete:
-        left = sum(each.planned - each.asked for each in searches)
-        wide.print(f"the budget is spent, {left} trials are left: the same command continues")
+        left = counted(sum(each.planned - each.asked for each in searches), "trial")
+        wide.print(f"the budget is spent, {left} left: the same command continues")
     for each in searches:
         if each.written is None:
             continue
         words = [each.base.model.name, write_setting("preset", str(each.written))]
         line = command("run", *words, "--task", each.request.task, runs=runs)
         wide.print(f"next: {line}", markup=False, soft_wrap=True)
-    kept = sum(item.size for item in garbage(runs / FOLDER, searches[0].base.task.name)[0])
+    task = searches[0].base.task.name
+    kept = sum(item.size for item in garbage(runs / FOLDER, task)[0])
     if kept >= MUCH:
-        line = command("runs", "gc", "--yes", runs=runs / FOLDER)
+        line = command("runs", "gc", "--task", task, "--yes", runs=runs / FOLDER)
         wide.print(
             f"trials keep {size_text(kept)} so that they can be extended by more epochs; to free it: {line}",
             markup=False,
