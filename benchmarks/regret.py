@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,41 +24,57 @@ from qrlsuite.statistics import Grid
 from qrlsuite.statistics.times import times_below
 from qrlsuite.tuning.search import Search
 
-NETWORKS = (("vqe-h2", "mlp width=6"), ("vqe-h2", "mlp width=6 activation=sin"), ("pulse", "mlp width=8"))
+NETWORKS = (
+    ("vqe-h2", "mlp width=6", None, (2e-4, 1e-2), (0.3, 30)),
+    ("vqe-h2", "mlp width=6 activation=sin", None, (2e-4, 1e-2), (0.3, 30)),
+    ("cartpole", "reinforce mlp width=8", 50, (2e-3, 2e-1), (0.1, 10)),
+)
+"""Task, network, epochs (None takes the task's), and the ranges of learning rate and gain, as in the studies."""
+
 # As a file: these two options are varied, and none of those that models and algorithms name for tuning.
 VARIED = """
 format_version = 1
 
 [search.all.all]
-lr = { low = 2e-4, high = 1e-2, log = true }
-input_scale = { low = 0.3, high = 30, log = true }
+lr = {{ low = {}, high = {}, log = true }}
+input_scale = {{ low = {}, high = {}, log = true }}
 """
 FIRST_SEED = 1_100_000
 SEEDS = 200
 
 
-def searched(
-    task: str, model: str, runs: Path, sampler: str = "bayesian", seeds: int | None = None
-) -> Search:
-    """Return a finished search."""
-    runs.mkdir(parents=True, exist_ok=True)
-    varied = runs / "varied.toml"
-    varied.write_text(VARIED)
-    [search] = api.tune(
-        task, model, vary=str(varied), sampler=sampler, seeds=seeds, runs=runs, workers=1, progress=False
-    )
-    return search
+@dataclass(frozen=True)
+class Network:
+    """What is tuned, and below which folder."""
 
+    task: str
+    model: str
+    epochs: int | None
+    lr: tuple[float, float]
+    gain: tuple[float, float]
+    runs: Path
 
-def fresh_times(entry: Entry, runs: Path) -> tuple[float, float]:
-    """Return the mean steps of an entry on fresh seeds, and their standard error."""
-    store = EntryStore.create(runs, entry)
-    seeds = list(range(FIRST_SEED, FIRST_SEED + SEEDS))
-    train_group(store.path, seeds, entry.task.epochs(entry.algorithm.name))
-    curves = np.array([store.seed(seed).read().curve for seed in seeds])
-    grid = Grid.relative(entry.task.file.ranking.epsilons, [0.5])
-    times = times_below(curves, grid, entry.task.file.protocol.interactions).mean(axis=1)
-    return float(times.mean()), float(times.std(ddof=1) / len(times) ** 0.5)
+    def searched(self, folder: str, sampler: str = "bayesian", seeds: int | None = None) -> Search:
+        """Return a finished search."""
+        runs = self.runs / folder
+        runs.mkdir(parents=True, exist_ok=True)
+        varied = runs / f"varied-{self.task}.toml"
+        varied.write_text(VARIED.format(*self.lr, *self.gain))
+        [search] = api.tune(
+            self.task, self.model, vary=str(varied), sampler=sampler, seeds=seeds, epochs=self.epochs,
+            runs=runs, workers=1, progress=False,
+        )  # fmt: skip
+        return search
+
+    def fresh_times(self, entry: Entry) -> tuple[float, float]:
+        """Return the mean steps of an entry on fresh seeds, and their standard error."""
+        store = EntryStore.create(self.runs / "fresh", entry)
+        seeds = list(range(FIRST_SEED, FIRST_SEED + SEEDS))
+        train_group(store.path, seeds, self.epochs or entry.task.epochs(entry.algorithm.name))
+        curves = np.array([store.seed(seed).read().curve for seed in seeds])
+        grid = Grid.relative(entry.task.file.ranking.epsilons, [0.5])
+        times = times_below(curves, grid, entry.task.file.protocol.interactions).mean(axis=1)
+        return float(times.mean()), float(times.std(ddof=1) / len(times) ** 0.5)
 
 
 def main() -> None:
@@ -69,17 +86,18 @@ def main() -> None:
     runs = parser.parse_args().runs
     print("| task | network | runs | it says | runs of the large search | it says | measured regret (95%) |")
     print("|---|---|---|---|---|---|---|")
-    for task, model in NETWORKS:
-        small = searched(task, model, runs / "small")
+    for task, model, *given in NETWORKS:
+        network = Network(task, model, *given, runs)
+        small = network.searched("small")
         trials = 2 * math.ceil(small.runs_done / 4 / 2)
-        large = searched(task, model, runs / "large", f"bayesian regret=.0001 trials={trials}", 20)
+        large = network.searched("large", f"bayesian regret=.0001 trials={trials}", 20)
         entries = [search.best.entry for search in (small, large) if search.best]
-        (own, error), (best, error_best) = (fresh_times(entry, runs / "fresh") for entry in entries)
+        (own, error), (best, error_best) = map(network.fresh_times, entries)
         reach = 1.96 * math.hypot(error / own, error_best / best) * (entries[0].hash != entries[1].hash)
         low, middle, high = (math.expm1(math.log(own / best) + sign * reach) for sign in (-1, 0, 1))
         says = [search.as_dict()["regret"]["expected"] for search in (small, large)]
         print(
-            f"| {task} | {model} | {small.runs_done} | {says[0]:.1%} | {large.runs_done} | {says[1]:.1%} "
+            f"| `{task}` | {model} | {small.runs_done} | {says[0]:.1%} | {large.runs_done} | {says[1]:.1%} "
             f"| {middle:.1%} ({low:.1%} to {high:.1%}) |",
             flush=True,
         )

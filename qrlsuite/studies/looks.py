@@ -443,7 +443,7 @@ def new(
     while first_seed is None and study.trained_before():
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
-    names, shared = list(study.entries), []
+    names, shared = list(study.entries), list[str]()
     if not any(table.name for table in study.file.entries):  # names that were written stay as they are
         names, shared = _brief(names)
     if shared:
