@@ -131,6 +131,60 @@ def board(task: str) -> Rows:
     return _chosen(sheet, heads)
 
 
+PAIRS: dict[str, tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = {
+    task: (
+        (
+            f"Does a circuit beat {'the network' if len(networks) == 1 else 'networks'} of its size?",
+            tuple((circuit, network) for circuit in ("iqp", "jerbi") for network in networks),
+        ),
+        ("Does entanglement help?", (("iqp", "iqp mean-field"), ("jerbi", "jerbi mean-field"))),
+        ("Do gates on two qubits help?", (("iqp", "iqp separable"), ("jerbi", "jerbi separable"))),
+        ("Do larger networks need fewer steps?", (("iqp", "width 16"), ("iqp", "width 64"))),
+    )
+    for task, networks in (("vqe-h2", ("width 6",)), ("pulse", ("width 8", "sines")))
+}
+"""The pairs of boards of small circuits that answer a question, by short names of the entries."""
+
+
+def _short(label: str) -> str:
+    """Name an entry of these boards: `width 6`, `sines`, `jerbi mean-field`."""
+    words = label.split()
+    if "mlp" in words:
+        return "sines" if "activation=sin" in words else words[2].replace("=", " ")
+    control = next((word.partition("=")[2] for word in words if word.startswith("entangled=")), "")
+    return f"{'jerbi' if 'ansatz=jerbi' in words else 'iqp'} {control}".strip()
+
+
+def pairs(task: str) -> Rows:
+    """The pairs that answer the questions of a board: each by itself, and what the board decides."""
+    yield "question", "pair", "difference (95%)", "on the board"
+    [section] = api.board(task, published=True, runs="none").sections
+    facts = section.as_dict()
+    order = [row["entry"] for row in facts["times"]["entries"]]
+    rows = {_short(row["label"]): row for row in facts["rows"]}
+    for question, asked in PAIRS[task]:
+        for place, (first, second) in enumerate(asked):
+            one, two = rows[first], rows[second]
+            compared = api.compare(one["label"], two["label"], task=task, published=True, runs="none")
+            times = compared.as_dict()["times"]
+            p = facts["times"]["adjusted_p"][order.index(one["entry"])][order.index(two["entry"])]
+            own = second.startswith(first)
+            other = f"its {second.removeprefix(f'{first} ')} control" if own else second
+            yield (
+                "" if place else question,
+                f"`{first}` against {other}",
+                f"`{first}` needs {_fewer_or_more(times['difference'], *times['difference_interval'])}",
+                "decided" if p <= 0.05 else "not told apart",
+            )
+
+
+def _fewer_or_more(difference: float, low: float, high: float) -> str:
+    """Write how many more steps one needs: `25% fewer (12% to 36%)`, `2% fewer (6% fewer to 1% more)`."""
+    near, far = sorted((abs(low), abs(high)))
+    span = f"{near:.0%} to {far:.0%}" if low * high > 0 else f"{-low:.0%} fewer to {high:.0%} more"
+    return f"{abs(difference):.0%} {'fewer' if difference < 0 else 'more'} ({span})"
+
+
 def tiers(task: str) -> Rows:
     """The same by the paper's definition."""
     [sheet] = api.board(task, rule="paper", published=True, runs="none").sheets()
@@ -167,6 +221,7 @@ OF_STUDIES: dict[str, Callable[[StudyOutcome], Rows]] = {
 }
 OF_BOARDS: dict[str, Callable[[str], Rows]] = {
     "board": board,
+    "pairs": pairs,
     "tiers": tiers,
     "executions": executions,
     "changes": changes,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -80,42 +79,3 @@ def test_the_two_halves_of_the_seeds() -> None:
     text = BOARD.replace("\n", " ")
     assert f"the 10-qubit circuit is ahead in {first} cell;" in text
     assert f"on seeds 50 to 99 the circuit is ahead in {second} cells" in text
-
-
-@pytest.mark.parametrize(
-    ("heading", "task", "networks"),
-    [("Hydrogen", "vqe-h2", ("width 6",)), ("Pulses", "pulse", ("width 8", "sines"))],
-)
-def test_the_pairs_of_boards_of_small_circuits(heading: str, task: str, networks: tuple[str, ...]) -> None:
-    rows = PAGE.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
-    [section] = api.board(task, published=True, runs="none").sections
-    board = section.as_dict()
-    order = [row["entry"] for row in board["times"]["entries"]]
-    named = {}
-    for row in board["rows"]:
-        words = row["label"].split()
-        if "mlp" in words:
-            name = "sines" if "activation=sin" in words else words[2].replace("=", " ")
-        else:
-            name = "`jerbi`" if "ansatz=jerbi" in words else "`iqp`"
-        control = next((word.partition("=")[2] for word in words if word.startswith("entangled=")), "")
-        named[f"{name} {control}".strip()] = row
-    assert len(named) == len(order) == 8 + len(networks)
-    others = (*networks, "mean-field", "separable")
-    pairs = [(circuit, other) for circuit in ("`iqp`", "`jerbi`") for other in others]
-    for first, other in (*pairs, ("`iqp`", "width 16"), ("`iqp`", "width 64")):
-        one, two = named[first], named[other if other in named else f"{first} {other}"]
-        compared = api.compare(one["label"], two["label"], task=task, published=True, runs="none")
-        found = re.search(r"needs ([\d.]+)% fewer .* \(([\d.-]+)% to ([\d.]+)%", compared.verdict)
-        [row] = [row for row in rows if f"| {first} against {'its ' * (other not in named)}{other} " in row]
-        p = board["times"]["adjusted_p"][order.index(one["entry"])][order.index(two["entry"])]
-        assert row.endswith(f"| {'decided' if p <= 0.05 else 'not told apart'} |")
-        if found is None:
-            assert "not told apart" in compared.verdict
-            continue
-        fewer, low, high = (f"{float(each):.0f}%" for each in found.groups())
-        assert f" {fewer} fewer" in row
-        assert f" ({low} to {high}) |" in row
-        assert (f"{other} needs" in row) == (
-            two["label"].removeprefix("ddqn ") in compared.verdict.partition(" needs ")[0]
-        )
