@@ -130,7 +130,7 @@ PICTURES: dict[str, Picture] = {
     ),
     "study-equal-size-beam6g-tasks.png": Plot(
         "study draw equal-size-beam6g equal-size-beam6g-degree5 equal-size-beam6g-a3-0 equal-size-cartpole "
-        "equal-size-vqe-h2 equal-size-pulse",
+        "equal-size-frozenlake equal-size-vqe-h2 equal-size-pulse",
         ("plans/equal-size-*", "plans/equal-size-*/*/*"),
     ),
     "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
