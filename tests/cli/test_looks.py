@@ -31,8 +31,6 @@ from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
-from qrlsuite.statistics.sequential import Decided
-from qrlsuite.studies import together
 from qrlsuite.studies.outcome import needs_text
 from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, cases, results
@@ -681,44 +679,6 @@ def test_far_more_seeds_than_the_last_look_are_not_counted(seeds: int, said: str
     assert needs_text(outcome, needs) == f"p <= 0.0021 at 40 seeds; {said} difference stays as it is now"
 
 
-TOGETHER = ("quantum-or-not", "quantum-or-not-degree5", "quantum-or-not-a3-0")
-
-
-def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks() -> None:
-    found = answer("show", *TOGETHER)
-    outcomes = [api.read_study(name) for name in TOGETHER]
-    assert found["tasks"] == ["beam6g", "beam6g-degree5", "beam6g-a3-0"]
-    assert found["seeds"] == [20, 20, 20]
-    assert {"10 qubits", "width 14"} <= set(found["changed"]), "untuned on beam6g, tuned elsewhere"
-    assert answer("show", *TOGETHER[1:])["changed"] == []
-    families = [{(pair["first"], pair["second"]) for pair in each.as_dict()["pairs"]} for each in outcomes]
-    assert [(pair["first"], pair["second"]) for pair in found["pairs"]] == [
-        (pair["first"], pair["second"])
-        for pair in outcomes[0].as_dict()["pairs"]
-        if all((pair["first"], pair["second"]) in family for family in families)
-    ]
-    for pair in found["pairs"]:
-        logs = []
-        for each in outcomes:
-            first, second = (
-                np.mean([each.state.curves[pair[side]].values[:20] < t for t in each.study.grid.thresholds])
-                for side in ("first", "second")
-            )  # of all epochs: a pair that went on counts with its first look, too
-            logs.append(math.log(second / first))
-        assert list(pair["differences"].values()) == pytest.approx(np.expm1(logs))
-        assert pair["difference"] == pytest.approx(math.expm1(np.mean(logs)))
-        assert pair["interval"][0] < pair["difference"] < pair["interval"][1]
-    went_on = next(pair for pair in found["pairs"] if pair["second"] == "width 32")
-    last_look = next(
-        pair for pair in outcomes[0].pairs if (pair.first, pair.second) == ("10 qubits", "width 32")
-    )
-    assert last_look.n_runs == 100
-    assert went_on["differences"]["beam6g"] != pytest.approx(last_look.difference, abs=1e-6)
-    shown = say("show", "study", *TOGETHER).stdout
-    assert "nothing follows for other tasks" in shown
-    assert shown.count("10 qubits / width 14") == 1
-
-
 def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
     """By the published study, of which some pairs are equal because neither learns in time."""
     outcome = api.read_study("dissecting")
@@ -748,62 +708,18 @@ def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
     assert "neither had the time to learn" in page.note
 
 
-def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path) -> None:
-    told = answer("study", "draw", *TOGETHER, "--runs", str(tmp_path))
-    assert [picture["picture"] for picture in told["pictures"]] == ["tasks"]
-    assert (tmp_path / "study-quantum-or-not-tasks.png").read_bytes().startswith(b"\x89PNG")
-    read = api.read_study(*TOGETHER)
-    assert isinstance(read, together.StudiesTogether)
-    [axes] = drawing.draw_together(read).axes
-    names = [label.get_text() for label in axes.get_yticklabels()]
-    lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}
-    size = len(TOGETHER) + 2
-    assert len(names) == size * len(read.pairs)
-    for place, shared in enumerate(read.pairs):
-        head, *tasks, mean = names[place * size : (place + 1) * size]
-        assert head == f"{shared.first} / {shared.second}"
-        assert tuple(tasks) == read.tasks
-        assert mean == f"mean of 3 tasks: {shared.verdict}"
-        own = [
-            pair.interval
-            for study in read.studies
-            for pair in study.pairs
-            if (pair.first, pair.second) == (shared.first, shared.second)
-        ]
-        for row, interval in enumerate((*own, shared.ratio.interval), start=place * size + 1):
-            assert lines[row].get_xdata() == pytest.approx([1 + end for end in interval])
-    pair = next(each for each in read.studies[0].pairs if each.decided is Decided.FIRST)
-    turned = drawing._reversed(pair)
-    assert (turned.first, turned.second) == (pair.second, pair.first)
-    assert turned.decided is Decided.SECOND
-    ratios = [1 / (1 + each) - 1 for each in (pair.difference, *reversed(pair.interval))]
-    assert [turned.difference, *turned.interval] == pytest.approx(ratios)
-
-
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:
     write()
     for names, said in (
-        ((TOGETHER[0], TOGETHER[0]), "two studies are of task 'beam6g'"),
-        ((TOGETHER[0], "memory"), "two studies are of task 'beam6g'"),
-        ((TOGETHER[0], "quantum-or-not-cartpole"), "have no pair of entries in common"),
-        ((TOGETHER[0], "fig7"), "study 'fig7' has no looks"),
-        ((TOGETHER[0], "widths.toml"), "'widths' has not taken its first look: qrlsuite study run widths"),
-        ((TOGETHER[0], "mlp"), "unknown study 'mlp'"),
+        (("quantum-or-not", "quantum-or-not"), "two studies are of task 'beam6g'"),
+        (("quantum-or-not", "memory"), "two studies are of task 'beam6g'"),
+        (("quantum-or-not", "quantum-or-not-cartpole"), "have no pair of entries in common"),
+        (("quantum-or-not", "fig7"), "study 'fig7' has no looks"),
+        (
+            ("quantum-or-not", "widths.toml"),
+            "'widths' has not taken its first look: qrlsuite study run widths",
+        ),
+        (("quantum-or-not", "mlp"), "unknown study 'mlp'"),
         (("mlp", "gru", "drqn"), "or several studies"),
     ):
         assert said in refused("show", *names)
-
-
-def test_a_pair_without_a_ratio_is_left_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    outcomes = [api.read_study(name) for name in TOGETHER[1:]]
-    assert all(isinstance(each, studies.StudyOutcome) for each in outcomes)
-    read = together.StudiesTogether(tuple(outcomes))  # type: ignore[arg-type]
-    times = together.StudiesTogether._times
-
-    def never_below(self: Any, outcome: Any, name: str) -> Any:
-        return times(self, outcome, name) * (name != "sine 44")
-
-    monkeypatch.setattr(together.StudiesTogether, "_times", never_below)
-    assert len(read.pairs) == len(read._named) - 2
-    assert [line.partition(":")[0] for line in read.left_out] == ["10 qubits / sine 44", "sine 44 / width 14"]
-    assert "left out: 10 qubits / sine 44: " in repr(read)
