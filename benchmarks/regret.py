@@ -4,7 +4,7 @@ Each network below is tuned until the search states a regret of 5 percent. A sea
 times as many seeds for each trial, and twice as many trials, without an earlier end. The settings of both are trained
 on 200 seeds that neither search has seen. The difference of their steps below threshold is the regret, with a 95%
 interval. It is measured against the best that the large search found, so it is a lower bound of the regret against the
-best there is. Half an hour of one core. A repeated call continues.
+best there is. About an hour of one core. A repeated call continues.
 """
 
 from __future__ import annotations

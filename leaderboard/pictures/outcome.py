@@ -193,15 +193,17 @@ def draw_together(together: StudiesTogether) -> Figure:
 
 
 def _reversed(pair: PairDecision) -> PairDecision:
-    """Return a pair with its entries exchanged."""
+    """Return a pair with its entries exchanged, in all that a row shows."""
     decided = {Decided.FIRST: Decided.SECOND, Decided.SECOND: Decided.FIRST}
-    low, high = pair.interval
+    difference, high, low = (
+        math.inf if end == -1 else 1 / (1 + end) - 1 for end in (pair.difference, *pair.interval)
+    )
     return dataclasses.replace(
         pair,
         first=pair.second,
         second=pair.first,
-        difference=1 / (1 + pair.difference) - 1,
-        interval=(1 / (1 + high) - 1, 1 / (1 + low) - 1),
+        difference=difference,
+        interval=(low, high),
         decided=pair.decided and decided.get(pair.decided, pair.decided),
     )
 

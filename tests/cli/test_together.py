@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,8 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
     assert turned.decided is Decided.SECOND
     ratios = [1 / (1 + each) - 1 for each in (pair.difference, *reversed(pair.interval))]
     assert [turned.difference, *turned.interval] == pytest.approx(ratios)
+    unbounded = drawing._reversed(replace(pair, interval=(-1.0, math.inf)))
+    assert unbounded.interval == (-1.0, math.inf)
 
 
 def test_a_pair_without_a_ratio_is_left_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:

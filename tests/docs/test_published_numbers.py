@@ -79,3 +79,16 @@ def test_the_two_halves_of_the_seeds() -> None:
     text = BOARD.replace("\n", " ")
     assert f"the 10-qubit circuit is ahead in {first} cell;" in text
     assert f"on seeds 50 to 99 the circuit is ahead in {second} cells" in text
+
+
+def test_what_the_board_of_pulse_took() -> None:
+    text = " ".join(PAGE.partition("\n## Pulses\n")[2].partition("\n## ")[0].split())
+    records = [json.loads(path.read_text()) for path in sorted((PUBLISHED / "pulse").glob("*/entry.json"))]
+    tunings = [record["tuning"] for record in records]
+    assert all(tuning["regret"]["expected"] <= 0.05 for tuning in tunings)
+    runs = [tuning["runs"] for tuning in tunings]
+    assert f"All entries reached it, after {min(runs)} to {max(runs)} runs each" in text
+    [section] = api.board("pulse", published=True, runs="none").sections
+    spent = [float(row["core_hours"]) for row in section.as_dict()["rows"]]
+    hours = sum(tuning["core_hours"] for tuning in tunings)
+    assert f"It took {hours:.2f} core-hours, and the 500 runs {sum(spent):.2f}." in text

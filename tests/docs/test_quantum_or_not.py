@@ -132,6 +132,7 @@ def test_what_a_larger_batch_changes() -> None:
     assert said.format(*seconds) in PROSE
 
 
+FIRST_FOUR = ("beam6g", "beam6g-degree5", "vqe-h2", "pulse")
 ONE_SIZE = ("beam6g", "beam6g-degree5", "beam6g-a3-0", "cartpole", "frozenlake", "vqe-h2", "pulse")
 
 
@@ -169,6 +170,13 @@ def test_one_size_on_several_tasks() -> None:
     found = said("beam6g", "network"), said("pulse", "network"), said("pulse", "sines")
     assert "needs {} more steps ({} to {}; to reach 0.9, {}, {} to {})".format(*found[0]) in PROSE
     assert "on `pulse` {} more ({} to {})".format(*found[1]) in PROSE
+    assert "on `frozenlake` {} more ({} to {})".format(*said("frozenlake", "network")) in PROSE
+    fewer, high, low = (number.removeprefix("-") for number in said("frozenlake", "sines")[:3])
+    assert f"{fewer} fewer on `frozenlake` ({low} to {high})" in PROSE
+    spans = [
+        "{1} to {2}".format(*said(task, "mean-field")) for task in ("pulse", "beam6g-a3-0", "frozenlake")
+    ]
+    assert "({}, {} and {})".format(*spans) in PROSE
     assert "on `pulse`: {} ({} to {}; to reach 0.98, {}, {} to {})".format(*found[2]) in PROSE
     fewer, high, low = (number.removeprefix("-") for number in said("vqe-h2", "sines")[:3])
     assert f"They need {fewer} fewer steps on `vqe-h2` ({low} to {high})" in PROSE
@@ -181,6 +189,20 @@ def test_the_mean_over_tasks_decides_nothing() -> None:
     assert f"<!-- table: {names} together -->" in PROSE
     _, network, sines, mean_field = tables.together(names)
     assert {row[1] for row in (network, sines, mean_field)} == {"not told apart"}
+    for part, words in (
+        (ONE_SIZE, "the seven give {} ({} to {}, p {})"),
+        (FIRST_FOUR, "the network {} more steps"),
+    ):
+        row = next(
+            row
+            for row in tables.together("+".join(f"equal-size-{task}" for task in part))
+            if "network" in row[0]
+        )
+        values = [
+            f"{'-' * (each[0] == '-')}{each.lstrip('+-')}" for each in re.findall(r"[+-][\d.]+%", row[2])
+        ]
+        assert words.format(*values, row[3].removeprefix("0")) in PROSE
+        assert f"p {row[3].removeprefix('0')})" in PROSE
     mean, high, low = re.findall(r"[\d.]+%", sines[2])
     p = sines[3].removeprefix("0")
     assert f"Sines need {mean} fewer steps than the circuit ({low} to {high} by itself, p {p} over" in PROSE
