@@ -128,7 +128,7 @@ PICTURES: dict[str, Picture] = {
     "study-larger-batch-entries.png": Plot(
         "study draw larger-batch", ("plans/larger-batch", "plans/larger-batch/beam6g/*")
     ),
-    "study-equal-size-beam6g-tasks.png": Plot(
+    "study-equal-size-tasks.png": Plot(
         "study draw equal-size-beam6g equal-size-beam6g-degree5 equal-size-beam6g-a3-0 equal-size-cartpole "
         "equal-size-frozenlake equal-size-vqe-h2 equal-size-pulse",
         ("plans/equal-size-*", "plans/equal-size-*/*/*"),
@@ -153,7 +153,7 @@ CAPTIONS = {
     "study-fidelity-text.png": "The text's replay buffer and copies",
     "study-quantum-or-not-entries.png": "A study with looks: every entry",
     "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
-    "study-equal-size-beam6g-tasks.png": "Studies of several tasks: every pair, task by task",
+    "study-equal-size-tasks.png": "Studies of several tasks: every pair, task by task",
     "study-larger-batch-entries.png": "A study with looks: where models learn in a third of the steps",
     "predictors.png": "Sixteen circuits: how fast they learn, and what was known of them before",
     "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",

@@ -311,13 +311,14 @@ def draw_study(
     if study.file.looks is not None or more:
         require_unchanged(name, {"options": options, "models": models, "only": only, "--seeds": seeds})
         outcomes = tuple(_outcome(each, folder) for each in (name, *more))
-        pictures = (
-            studies.draw_together(StudiesTogether(outcomes)) if more else studies.draw_outcome(outcomes[0])
-        )
+        together = StudiesTogether(outcomes) if more else None
+        shown = study.name if together is None else together.name
+        pictures = studies.draw_outcome(outcomes[0]) if together is None else studies.draw_together(together)
     else:
+        shown = study.name
         members = study_runner.select(study, from_mapping(options), models, several(only))
         pictures = studies.draw(study, members, folder, with_published=published, seeds=seeds)
-    drawn = studies.write(study.name, pictures, folder, format)
+    drawn = studies.write(shown, pictures, folder, format)
     if not any(each.path for each in drawn):
         reasons = sorted({each.problem for each in drawn})
         hint = "" if published else "; --published draws the entries that come with the suite"

@@ -114,6 +114,12 @@ def devices(made: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
     return tuple(sorted({device_kind(origin) for origin in made}))
 
 
+def gpus(made: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Return the names of every device that occurs but the CPU; the kind of one without a name."""
+    named = (origin["device"] for origin in made if device_kind(origin) != "cpu")
+    return {str(device.get("name") or device["kind"])[:80] for device in named}
+
+
 def _device(device: torch.device) -> dict[str, str]:
     import torch
 

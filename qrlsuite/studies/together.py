@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,14 @@ class StudiesTogether(Shown):
             raise OptionError(
                 f"{names} have no pair of entries in common: pairs are matched by the entries' names"
             )
+
+    @property
+    def name(self) -> str:
+        """The words with which all names of the studies begin, or the first study's name."""
+        names = [study.study.name for study in self.studies]
+        columns = zip(*(name.split("-") for name in names))
+        common = [words[0] for words in takewhile(lambda words: len(set(words)) == 1, columns)]
+        return "-".join(common) or names[0]
 
     @property
     def tasks(self) -> tuple[str, ...]:

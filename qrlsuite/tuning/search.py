@@ -232,6 +232,7 @@ class Search(Shown):
         self.written: Path | None = None
         self.asked = 0
         self._seconds: dict[tuple[str, int], float] = {}
+        self._gpus: set[str] = set()
         self._begin()
 
     def _entry(self, point: space.Point | None = None) -> Entry:
@@ -372,6 +373,8 @@ class Search(Shown):
         )
         own = {(entry.hash, seed): store.seed(seed).seconds() for seed in seeds}
         self._seconds |= own
+        for seed in seeds:
+            self._gpus |= provenance.gpus((store.seed(seed).record() or {}).get("provenance", []))
         spent = sum(own.values())
         spread = self._spread(curves, worth)
         trial = Trial(
@@ -417,6 +420,9 @@ class Search(Shown):
             for spec in (best.entry.model, best.entry.algorithm)
         ]
         extra = ["optuna"] if self.request.sampler == "tpe" else []
+        how = self._how()
+        trained = [f"trials trained on {', '.join(sorted(self._gpus))}"] if self._gpus else []
+        notes = [text for text in (how.get("note"), *trained) if text]
         return preset.PresetFile(
             format_version=1,
             algorithm=best.entry.algorithm.name,
@@ -434,7 +440,7 @@ class Search(Shown):
                 steps=self.runs_done * self.steps_per_run,
                 versions=dict(provenance.collect([*plugins, *extra])["versions"]),
                 core_hours=float(f"{self.core_seconds / 3600:.3g}"),
-                **self._how(),
+                **{**how, "note": "; ".join(notes) or None},
             ),
         )
 

@@ -133,6 +133,24 @@ def test_the_preset_is_the_best_trial_and_the_entry_says_so(tiny_task: str, tmp_
     assert store.record()["tuning"]["trials"] == 4, "and does not forget it"
 
 
+def test_the_preset_names_the_gpu_that_trained_its_trials(tiny_task: str, tmp_path: Path) -> None:
+    here = search.Search(request(tiny_task), tmp_path)
+    finish(here)
+    tuning = here.preset().tuning
+    assert tuning is not None
+    assert tuning.note is None
+    first = EntryStore.create(here.runs, here.trials[0].entry).seed(here.trials[0].seeds[0])
+    record = first.record()
+    assert record is not None
+    record["provenance"][0]["device"] = {"kind": "cuda", "name": "NVIDIA H200"}
+    first.write_record(record)
+    again = search.Search(request(tiny_task), tmp_path)
+    assert finish(again).trained == 0
+    tuning = again.preset().tuning
+    assert tuning is not None
+    assert tuning.note == "trials trained on NVIDIA H200"
+
+
 def test_tuning_seeds_are_not_protocol_seeds() -> None:
     assert search.tuning_seeds("3") == (1_000_000, 1_000_001, 1_000_002)
     assert search.tuning_seeds("1000005:1000007") == (1_000_005, 1_000_006)
