@@ -7,6 +7,7 @@ import gc
 import io
 import itertools
 import os
+import signal
 import sys
 import warnings
 from typing import Any
@@ -22,6 +23,8 @@ from qrlsuite.registry import STRICT, PluginWarning
 
 def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: save, and say so
     # imports make a million objects that stay: to look for garbage among them takes a third of a short command's time
     gc.set_threshold(20_000, 20, 20)
     atexit.register(gc.freeze)

@@ -161,6 +161,11 @@ class TuneDisplay:
             f"The same {self.again} continues from there.",
             soft_wrap=True,
         )
+        for search in self.searches:
+            if search.written is not None:
+                self.console.print(
+                    f"the best settings so far: {search.written}", markup=False, soft_wrap=True
+                )
 
 
 def _short(values: Any) -> str:

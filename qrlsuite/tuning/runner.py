@@ -63,6 +63,8 @@ def run(
 ) -> bool:
     """Run trials, then write the preset file of each search that has a best trial and waits for none.
 
+    After Ctrl-C, the files have the best settings so far.
+
     No trials are begun that would not end within the requests' budget of time, one after the other and at the pace of
     those before. Trials that an earlier call finished cost no time.
 
@@ -87,14 +89,19 @@ def run(
         budget = searches[0].request.seconds(where.workers)
         complete = _run(searches, runs, where, display, budget)
     except KeyboardInterrupt:
+        _write(searches, out)
         display.interrupted()
         raise
     finally:
         display.close()
+    _write(searches, out)
+    return complete
+
+
+def _write(searches: Sequence[Search], out: Path | None) -> None:
     for search in searches:
         if search.presentable:
             search.write(out or search.path)
-    return complete
 
 
 def _run(

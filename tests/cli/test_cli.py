@@ -75,7 +75,10 @@ def label(entry: Path) -> str:
     return str(EntryStore(entry).record()["label"])
 
 
-def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, hold: Hold) -> None:
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM], ids=lambda sign: sign.name)
+def test_ctrl_c_saves_and_the_same_command_resumes(
+    sign: signal.Signals, task: str, tmp_path: Path, hold: Hold
+) -> None:
     def words(runs: str) -> list[str]:
         run = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "3", "--epochs", "8"]
         return [*run, "--runs", str(tmp_path / runs), "--workers", "2"]
@@ -85,7 +88,7 @@ def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, ho
     stopped = tmp_path / "stopped" / "tiny" / straight.name
     process = start(*words("stopped"), env=hold.environment)
     hold.wait(process, workers=2)
-    os.kill(process.pid, signal.SIGINT)
+    os.kill(process.pid, sign)
     _, message = process.communicate(timeout=HANGS)
     assert process.returncode == 130
     assert "every finished epoch is saved. The same command continues" in message

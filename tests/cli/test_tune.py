@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import signal
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,32 @@ def test_it_says_the_size_first_and_wants_large_searches_confirmed(tiny_task: st
     with pytest.raises(QrlSuiteError, match="--yes starts them all"):
         say(*words)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_search_that_is_stopped_leaves_the_best_settings_so_far(
+    tiny_task: str, tmp_path: Path, hold: Hold
+) -> None:
+    words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3,1e-4"]
+    words += [
+        "--sampler",
+        "tpe trials=3",
+        "--seeds",
+        "1",
+        "--epochs",
+        "8",
+        "--workers",
+        "1",
+        "--runs",
+        str(tmp_path / "runs"),
+    ]
+    say(*words, "--budget", "0.01s")  # one trial
+    (path,) = (tmp_path / "runs" / "tuning").glob("*.toml")
+    path.unlink()
+    code, message = stop(words, hold, signal.SIGTERM)
+    assert code == 130, message
+    assert f"the best settings so far: {path}" in message.replace("\n", "")
+    record = tomllib.loads(path.read_text())["tuning"]
+    assert (record["trials"], record["planned"]) == (1, 3)
 
 
 def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path) -> None:

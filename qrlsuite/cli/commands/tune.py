@@ -119,8 +119,8 @@ def tune(
     """Find settings with which models learn in few steps, and write them to preset files.
 
     Several entries get equal budgets. Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries
-    are never judged by. Stop with Ctrl-C at any time; the same command continues, and ends with the same presets as
-    if it had never stopped.
+    are never judged by. Stop with Ctrl-C at any time: the best settings so far are written. The same command
+    continues, and ends with the same presets as if it had never stopped.
 
     Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
