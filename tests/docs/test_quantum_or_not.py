@@ -226,3 +226,48 @@ def test_the_hours_of_the_searches_of_one_size() -> None:
     }
     assert len(tunings) == 20
     assert f"with {sum(tunings.values()):.1f} core-hours in all" in PROSE
+
+
+def test_ten_qubits() -> None:
+    readme = " ".join((DOCS.parent / "README.md").read_text().split())
+    outcome = tables.published("ten-qubits")
+    pairs = {pair.second: pair for pair in outcome.pairs}
+    circuit = "10 qubits"
+    assert {pair.first for pair in outcome.pairs} == {circuit}
+    winners = {other: pair.verdict for other, pair in pairs.items() if pair.verdict.endswith("needs fewer")}
+    assert winners == {
+        "width 14": f"{circuit} needs fewer",
+        "sines 14": "sines 14 needs fewer",
+        "width 64": "width 64 needs fewer",
+    }
+    pair = pairs["width 14"]
+    numbers = (pair.difference, *pair.interval, pair.leading_difference, *pair.leading_interval)
+    assert (
+        "Width 14 needs {} more ({} to {}; to reach 0.9, {}, {} to {})".format(*map(percent, numbers))
+        in PROSE
+    )
+    assert f"beats the network of its size, which needs {percent(pair.difference)} more steps" in readme
+    pair = pairs["sines 14"]
+    low, high = pair.interval
+    least, most = sorted(-end for end in pair.leading_interval)
+    numbers = (-pair.difference, -high, -low, -pair.leading_difference, least, most)
+    assert (
+        "They need {} fewer steps ({} to {}; to reach 0.9, {}, {} to {})".format(*map(percent, numbers))
+        in PROSE
+    )
+    pair = pairs["width 64"]
+    low, high = pair.interval
+    assert f"Width 64 needs {percent(-pair.difference)} fewer ({percent(-high)} to {percent(-low)})" in PROSE
+    tunings = {each.name: each.tuning for each in outcome.study.file.entries}
+    regrets = {name: percent(tuning.regret.expected) for name, tuning in tunings.items()}
+    assert regrets == {
+        circuit: "6%",
+        "10 qubits mean-field": "5%",
+        "width 14": "4%",
+        "sines 14": "3%",
+        "width 64": "3%",
+        "6 qubits": "9%",
+    }
+    said = "6% for 10 qubits ({} trials, on an NVIDIA H200), 5% for mean-field ({}), 4% for width 14"
+    assert said.format(tunings[circuit].trials, tunings["10 qubits mean-field"].trials) in PROSE
+    assert tunings[circuit].note.endswith("trials trained on NVIDIA H200")
