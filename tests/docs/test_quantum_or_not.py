@@ -239,7 +239,16 @@ def test_ten_qubits() -> None:
         "width 14": f"{circuit} needs fewer",
         "sines 14": "sines 14 needs fewer",
         "width 64": "width 64 needs fewer",
+        "6 qubits": f"{circuit} needs fewer",
     }
+    pair = pairs["10 qubits mean-field"]
+    low, high = map(percent, pair.interval)
+    assert pair.verdict.startswith("not told apart by 60 seeds")
+    assert f"by 60 seeds ({percent(pair.difference)}, {low} to {high})" in PROSE
+    pair = pairs["6 qubits"]
+    assert (
+        "6 qubits need {} more ({} to {})".format(*map(percent, (pair.difference, *pair.interval))) in PROSE
+    )
     pair = pairs["width 14"]
     numbers = (pair.difference, *pair.interval, pair.leading_difference, *pair.leading_interval)
     assert (
