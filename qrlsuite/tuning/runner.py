@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 from qrlsuite.engine import missing
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import raise_failures
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import codes
@@ -89,7 +90,9 @@ def run(
         budget = searches[0].request.seconds(where.workers)
         complete = _run(searches, runs, where, display, budget)
     except KeyboardInterrupt:
-        _write(searches, out)
+        # trials of an earlier call may not be read again yet: its file may be better, and stays
+        with contextlib.suppress(QrlSuiteError):  # the interruption is what counts
+            _write([each for each in searches if not (out or each.path).exists()], out)
         display.interrupted()
         raise
     finally:
