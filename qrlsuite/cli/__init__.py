@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import gc
 import io
 import itertools
@@ -25,6 +26,7 @@ def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: save, and say so
+        os.register_at_fork(after_in_child=_end_by_sigterm)  # a pool of a plugin's ends its processes so
     # imports make a million objects that stay: to look for garbage among them takes a third of a short command's time
     gc.set_threshold(20_000, 20, 20)
     atexit.register(gc.freeze)
@@ -61,6 +63,8 @@ def main() -> None:
                     message = f"{option} is gone: {new}"
                 print(f"qrlsuite: {message}; see `{error.ctx.command_path} --help`", file=sys.stderr)
             sys.exit(2)
+        except KeyboardInterrupt:  # before the command began
+            sys.exit(130)
         except Abort:
             sys.exit("Aborted!")
         except QrlSuiteError as error:
@@ -70,6 +74,11 @@ def main() -> None:
         except BrokenPipeError:
             sys.stderr.close()  # the reader (head, less) has gone
             sys.exit(0)
+
+
+def _end_by_sigterm() -> None:
+    with contextlib.suppress(ValueError):  # forked by another thread: its handlers cannot be changed
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _load_plugins(paths: list[str]) -> None:

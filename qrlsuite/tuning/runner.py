@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from qrlsuite.engine import missing
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import raise_failures
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.experiment import identity
+from qrlsuite.experiment import identity, preset
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore
@@ -64,7 +63,7 @@ def run(
 ) -> bool:
     """Run trials, then write the preset file of each search that has a best trial and waits for none.
 
-    After Ctrl-C, the files have the best settings so far.
+    After Ctrl-C, the files have the best settings so far; one with more runs behind it stays as it is.
 
     No trials are begun that would not end within the requests' budget of time, one after the other and at the pace of
     those before. Trials that an earlier call finished cost no time.
@@ -90,15 +89,25 @@ def run(
         budget = searches[0].request.seconds(where.workers)
         complete = _run(searches, runs, where, display, budget)
     except KeyboardInterrupt:
-        # trials of an earlier call may not be read again yet: its file may be better, and stays
-        with contextlib.suppress(QrlSuiteError):  # the interruption is what counts
-            _write([each for each in searches if not (out or each.path).exists()], out)
+        try:
+            _write([each for each in searches if not _rests_on_more(out or each.path, each)], out)
+        except QrlSuiteError as error:
+            display.console.print(f"the best settings so far are not written: {error}", markup=False)
         display.interrupted()
         raise
     finally:
         display.close()
     _write(searches, out)
     return complete
+
+
+def _rests_on_more(path: Path, search: Search) -> bool:
+    """Whether a preset file has more runs behind it: trials of an earlier call may not be read again yet."""
+    try:
+        tuning = preset.load(path).tuning
+    except QrlSuiteError:
+        return False  # there is none, or it is damaged
+    return tuning is not None and (tuning.runs or 0) > search.runs_done
 
 
 def _write(searches: Sequence[Search], out: Path | None) -> None:

@@ -100,18 +100,8 @@ def test_a_search_that_is_stopped_leaves_the_best_settings_so_far(
     tiny_task: str, tmp_path: Path, hold: Hold
 ) -> None:
     words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3,1e-4"]
-    words += [
-        "--sampler",
-        "tpe trials=3",
-        "--seeds",
-        "1",
-        "--epochs",
-        "8",
-        "--workers",
-        "1",
-        "--runs",
-        str(tmp_path / "runs"),
-    ]
+    words += ["--sampler", "tpe trials=3", "--seeds", "1", "--epochs", "8"]
+    words += ["--workers", "1", "--runs", str(tmp_path / "runs")]
     say(*words, "--budget", "0.01s")  # one trial
     (path,) = (tmp_path / "runs" / "tuning").glob("*.toml")
     path.unlink()
@@ -120,6 +110,14 @@ def test_a_search_that_is_stopped_leaves_the_best_settings_so_far(
     assert f"the best settings so far: {path}" in message.replace("\n", "")
     record = tomllib.loads(path.read_text())["tuning"]
     assert (record["trials"], record["planned"]) == (1, 3)
+
+    better = path.read_text().replace("runs = 1\n", "runs = 2\n")
+    path.write_text(better)
+    stop(words, hold, signal.SIGINT)
+    assert path.read_text() == better, "a file with more runs behind it stays"
+    path.write_text(better.replace("runs = 2\n", "runs = 1\n").replace("trials = 1\n", "trials = 2\n"))
+    stop(words, hold, signal.SIGINT)
+    assert tomllib.loads(path.read_text())["tuning"]["trials"] == 1
 
 
 def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path) -> None:

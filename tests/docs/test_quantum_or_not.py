@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.store import read_lines
 from qrlsuite.studies.looks import FILE, LOG, StudyWithLooks
+from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.study import load as load_study
 from tests.docs import load, percent
 
@@ -280,3 +283,22 @@ def test_ten_qubits() -> None:
     said = "6% for 10 qubits ({} trials, on an NVIDIA H200), 5% for mean-field ({}), 4% for width 14"
     assert said.format(tunings[circuit].trials, tunings["10 qubits mean-field"].trials) in PROSE
     assert tunings[circuit].note.endswith("trials trained on NVIDIA H200")
+
+    def times(name: str, study: StudyOutcome) -> NDArray[np.float64]:
+        """Steps below each threshold in 30 epochs, mean over seeds."""
+        curves = study.state.curves[name].values[:, :30, None]
+        return 2000 * (curves < np.array(outcome.study.grid.thresholds)).sum(axis=1).mean(axis=0)
+
+    hand, ours = times("width 14", tables.published("larger-batch")), times(circuit, outcome)
+    more = [percent(a / b - 1) for a, b in ((hand.mean(), ours.mean()), (hand[0], ours[0]))]
+    assert f"needed {hand.mean() / 1000:.1f}k in 30 epochs" in PROSE
+    assert "these settings need {} more (16% to 44%), and {} more to reach 0.9".format(*more) in PROSE
+    assert f"with settings that were set by hand, we saw {more[1]} afterwards" in readme
+    first = outcome.state.curves[circuit].values[:20]
+    thresholds = np.array(outcome.study.grid.thresholds)
+    below = [
+        (curves[:, :, None] < thresholds).sum(axis=(0, 1))
+        for curves in (outcome.state.curves["sines 14"].values, first)
+    ]
+    low = (below[0] / below[1] - 1)[thresholds <= 0.7]
+    assert f"they needed {percent(min(low))} to {percent(max(low))} more on the same 20 seeds" in PROSE
