@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from qrlsuite import own
 from qrlsuite.cli import main
 from qrlsuite.cli.app import RENAMED, build
+from qrlsuite.errors import UnknownNameError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
 from tests.commands import answer, qrlsuite, say, start
@@ -59,6 +60,8 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
 
     compared = qrlsuite("compare", "mlp width=16", "mlp width=8", "--runs", runs)
     assert "undecided: fewer than 20 seeds" in compared.stdout
+    with pytest.raises(UnknownNameError, match="'mlp width=4' has seeds from 1,000,000 up alone"):
+        say("evaluate", "mlp width=4", "--runs", runs)
     say("plot", "curves", "--runs", runs, "--out", str(tmp_path / "c.svg"))
     assert (tmp_path / "c.svg").read_text().startswith("<?xml")
 

@@ -237,6 +237,12 @@ def test_circuits_of_six_gates_reach_the_ground_states_of_hydrogen() -> None:
         VQE(qubits=3)
 
 
+def test_circuits_of_eight_gates_reach_the_ground_states_of_three_spins() -> None:
+    lanes = VQELanes(VQEOptions(model="ising", qubits=3, steps=8), 64)
+    np.testing.assert_allclose(scores(lanes, BestCircuit), 1, atol=1e-6)
+    assert 0.5 < scores(lanes, GreedyGate).mean() < 0.9
+
+
 def test_outcomes_are_those_of_kraus_operators() -> None:
     """Every channel and experiment; and who asks what is informative is right more often."""
     p, paulis = 0.3, [pauli(letter) for letter in "XYZ"]
