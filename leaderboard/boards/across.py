@@ -18,7 +18,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard.boards import costs
-from qrlsuite.leaderboard.boards.ranked import learning_curves, ranking_of
+from qrlsuite.leaderboard.boards.ranked import learning_curves, of_one_definition, ranking_of
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import counted, steps_text
@@ -291,13 +291,10 @@ def _reaching(
     task: str, members: Sequence[EntryResults], horizon: int | None
 ) -> tuple[int, dict[str, EntryResults], list[str]]:
     """Return the horizon of a task, the entries that reach it by configuration, and lines about the others."""
-    lines, found = list[str](), dict[str, EntryResults]()
-    definition = Counter(entry.task_hash for entry in members).most_common(1)[0][0]
-    end = horizon or min(ranking_of(members).horizons)
-    for entry in members:
-        if entry.task_hash != definition:
-            lines.append(f"{task}: {entry.label}: made under another definition of the task")
-            continue
+    found = dict[str, EntryResults]()
+    ranked, lines = of_one_definition(members)
+    end = horizon or min(ranking_of(ranked or members).horizons)
+    for entry in ranked:
         reached = entry.reaching(end // entry.steps_per_epoch)
         if reached is None:
             steps = entry.longest * entry.steps_per_epoch

@@ -18,7 +18,7 @@ from qrlsuite.leaderboard.boards.pair import OnBoard, PairVerdict, judge_pair
 from qrlsuite.leaderboard.boards.ranked import WITH_LOOKS, learning_curves, ranking_of, rule_of
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.rules import DEFAULT
-from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults, edited_between
 from qrlsuite.statistics import Comparison, SignificanceRule, compare
 
 
@@ -116,11 +116,8 @@ def compare_entries(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
-    if len({first.environments, second.environments} - {frozenset()}) > 1:
-        raise QrlSuiteError(
-            f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
-            f"'{second.label}': their scores cannot be compared; train one of them again with --fresh"
-        )
+    if edited := edited_between(first, second):
+        raise QrlSuiteError(edited)
     for entry in (first, second):
         if entry.plan:
             raise QrlSuiteError(f"'{entry.label}' was {WITH_LOOKS}")

@@ -11,7 +11,7 @@ import numpy as np
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules
 from qrlsuite.leaderboard.rules import DEFAULT
-from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults, edited_between
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     LearningCurves,
@@ -53,7 +53,9 @@ WITH_LOOKS = (
 
 
 def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
-    """Leave out entries of studies with looks or chosen seeds, and those made under another definition than most.
+    """Leave out entries of studies with looks or chosen seeds, and those of another task or world than most.
+
+    Another task is another definition of it; another world is other code of its environment, where a plugin makes it.
 
     Returns
     -------
@@ -74,7 +76,18 @@ def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResult
             for entry in members
             if entry.task_hash != definition
         ]
-    return kept, problems
+    worlds, edited = [], list[str]()
+    for task in sorted({entry.task for entry in kept}):
+        members = [entry for entry in kept if entry.task == task]
+        codes = [tuple(sorted(entry.environments)) for entry in members if entry.environments]
+        most = max(sorted(set(codes)), key=codes.count, default=())
+        for entry in members:
+            if entry.environments and tuple(sorted(entry.environments)) != most:
+                of_most = next(other for other in members if tuple(sorted(other.environments)) == most)
+                edited.append(f"{entry.folder}: {edited_between(of_most, entry)}")
+            else:
+                worlds.append(entry)
+    return worlds, [*problems, *edited]
 
 
 def ranking_of(entries: Sequence[EntryResults]) -> RankingSection:

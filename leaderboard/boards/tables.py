@@ -378,7 +378,7 @@ def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
         ],
     }
     told = [f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels]
-    return [*_other_environments(entries), *told, *_edited(entries)]
+    return [*told, *_edited(entries)]
 
 
 def _grouped(labels: Mapping[str, Hashable]) -> str:
@@ -387,12 +387,6 @@ def _grouped(labels: Mapping[str, Hashable]) -> str:
     for label, group in labels.items():
         groups.setdefault(group, []).append(label)
     return " | ".join(map(", ".join, groups.values())) if len(groups) > 1 else ""
-
-
-def _other_environments(entries: Sequence[EntryResults]) -> list[str]:
-    """Say which entries were trained in environments of one name and other code: their scores are of other worlds."""
-    groups = _grouped({entry.label: entry.environments for entry in entries if entry.environments})
-    return [f"NOT COMPARABLE, the environment's code was edited between: {groups}"] * bool(groups)
 
 
 def _edited(entries: Sequence[EntryResults]) -> list[str]:

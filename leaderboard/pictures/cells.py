@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.pictures import style
-from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults, edited_between
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 from qrlsuite.statistics.grid import BoolArray, FloatArray
@@ -44,7 +45,7 @@ def measure(entry: EntryResults, grid: Grid, horizon: int) -> Cells:
 
 
 def one_task(entries: Sequence[EntryResults], kind: str) -> None:
-    """Raise OptionError unless there are entries, all of one task."""
+    """Raise OptionError unless there are entries, all of one task and of one code of its environment."""
     if not entries:
         raise OptionError(f"picture '{kind}' needs at least one entry")
     for entry in entries[1:]:
@@ -54,6 +55,9 @@ def one_task(entries: Sequence[EntryResults], kind: str) -> None:
                 f"picture '{kind}' shows one task: '{first.label}' was run on {first.task} ({first.task_hash}) "
                 f"and '{entry.label}' on {entry.task} ({entry.task_hash})"
             )
+    for first, entry in itertools.combinations(entries, 2):
+        if edited := edited_between(first, entry):
+            raise OptionError(edited)
 
 
 def choose_grid(

@@ -422,6 +422,16 @@ def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
     return registered.file if registered is not None and registered.hash == hash_ else stored
 
 
+def edited_between(first: EntryResults, second: EntryResults) -> str:
+    """Say that two entries of a task saw environments of other code, whose scores mean other things; empty if not."""
+    if len({first.environments, second.environments} - {frozenset()}) < 2:
+        return ""
+    return (
+        f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
+        f"'{second.label}': their scores cannot be compared; train one of them again with --fresh"
+    )
+
+
 def registered_task(name: str) -> Task | None:
     """Return a registered task, read once for all its entries; None where there is none, or it cannot be built."""
     return _registered(registry.load(), name)

@@ -274,8 +274,13 @@ def test_entries_of_an_edited_environment_are_not_compared(tmp_path: Path) -> No
     refused = qrlsuite("compare", "mlp width=2", "mlp width=3", *words[:4], cwd=tmp_path)
     assert refused.returncode == 2
     assert "the code of environment 'walk' was edited between" in refused.stderr
-    board = " ".join(qrlsuite("leaderboard", *words[:4], cwd=tmp_path).stdout.split())
-    assert "NOT COMPARABLE, the environment's code was edited between: " in board
+    board = qrlsuite("leaderboard", *words[:4], "--format", "json", cwd=tmp_path)
+    (section,), (left_out,) = (json.loads(board.stdout)[each] for each in ("sections", "refused"))
+    assert len(section["rows"]) == 1
+    assert "the code of environment 'walk' was edited between" in left_out
+    drawn = qrlsuite("plot", "curves", *words[:4], cwd=tmp_path)
+    assert drawn.returncode == 2
+    assert "their scores cannot be compared; train one of them again with --fresh" in drawn.stderr
     assert qrlsuite("run", "mlp width=2", *words, "--fresh", cwd=tmp_path).returncode == 0
     compared = qrlsuite("compare", "mlp width=2", "mlp width=3", *words[:4], cwd=tmp_path)
     assert compared.returncode == 0, compared.stderr
