@@ -41,8 +41,8 @@ def import_curves(
     ----------
     curves:
         By entry (seeds, points), (N,) and (N, K); or a table with the columns entry, seed, step and score (Arrow, or a
-        data frame of pandas or polars); or files: csv with these columns, `monitor.csv` and `evaluations.npz` of
-        Stable-Baselines3, event files of TensorBoard, offline files of W&B.
+        data frame of pandas or polars); or files: csv with these columns, `evaluations.npz`, `monitor.csv` and
+        `progress.csv` of Stable-Baselines3, event files of TensorBoard, offline files of W&B.
     steps:
         (K,) environment steps of `points`, increasing.
     task:

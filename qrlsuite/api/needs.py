@@ -120,7 +120,7 @@ def seeds_needed(
     UnknownNameError
         If an entry is unknown.
     OptionError
-        If an entry has a single seed, or they are of different tasks.
+        If an entry has a single seed, no seed reached a threshold, or they are of different tasks.
     """
     names = several(first) if second is None else (first, second)
     entries = [load(name, task=task, runs=runs, published=published) for name in names]
@@ -134,6 +134,12 @@ def seeds_needed(
     curves = [ranked.learning_curves(entry) for entry in entries]
     horizon = common_horizon(curves[0], curves[-1])
     curves = [each.cut(horizon) for each in curves]
+    grid = ranked.ranking_of(entries).grid
+    if all(mean_time(each, grid).at_cap.min() == 1 for each in curves):
+        raise OptionError(
+            f"no seed of {' or '.join(repr(entry.label) for entry in entries)} reached a threshold within {horizon} "
+            "steps, so no number of seeds tells such entries apart: train longer, or change the task's thresholds"
+        )
     per_pair, basis = _core_hours(entries, curves, Path(runs))
     console = Console(stderr=True, quiet=not progress, highlight=False)
     rows = []

@@ -42,6 +42,9 @@ WINDOW = 100
 _LONGEST_LINE = 1_000_000
 _NOT_FINITE = ("NaN", "Infinity", "-Infinity")
 
+_STEPS = "time/total_timesteps"
+"""The column of steps in the `progress.csv` of Stable-Baselines3's logger."""
+
 _CURVES = "evaluations.npz", "*monitor.csv", "*.tfevents.*", "*.wandb", "*.csv"
 _MOST_PATHS = 100_000
 
@@ -89,8 +92,8 @@ def holds_one_run(path: Path) -> bool:
         return True
     if not path.name.endswith(".csv"):
         raise FileError(
-            f"{path}: give a csv file with the columns entry,seed,step,score; monitor.csv or evaluations.npz of "
-            "Stable-Baselines3; events.out.tfevents.* of TensorBoard; or run-*.wandb of W&B"
+            f"{path}: give a csv file with the columns entry,seed,step,score; evaluations.npz, monitor.csv or "
+            "progress.csv of Stable-Baselines3; events.out.tfevents.* of TensorBoard; or run-*.wandb of W&B"
         )
     return False
 
@@ -115,7 +118,7 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
     Parameters
     ----------
     metric:
-        The scalar of TensorBoard or W&B that is the score.
+        The scalar of TensorBoard, W&B or progress.csv that is the score.
 
     Raises
     ------
@@ -127,8 +130,8 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
     if len(kinds) > 1 or reader is None or (reader is _evaluations and len(paths) > 1):
         names = listed([path.name for path in paths])
         raise FileError(f"{paths[0].parent}: {names} are of one run: name one of them")
-    if metric is not None and not _streamed(paths[0]):
-        raise FileError(f"{paths[0]}: metric={metric}: files of Stable-Baselines3 have one score")
+    if metric is not None and reader in (_monitor, _evaluations):
+        raise FileError(f"{paths[0]}: metric={metric}: {paths[0].name} has one score")
     return reader(paths, metric)
 
 
@@ -141,6 +144,8 @@ def _kind(path: Path) -> Callable[[Sequence[Path], str | None], Curve] | None:
         return _wandb
     if name.endswith(".npz"):
         return _evaluations
+    if name == "progress.csv" and _STEPS in next(lines_of(path), ""):
+        return _progress
     return _monitor if name == "monitor.csv" or name.endswith(".monitor.csv") else None
 
 
@@ -230,6 +235,25 @@ def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
         if episode[1] < 1:
             raise FileError(f"{path}, line {line + 1}: an episode of {episode[1]} steps")
         yield episode
+
+
+def _progress(paths: Sequence[Path], metric: str | None) -> Curve:
+    """Return a scalar of what Stable-Baselines3's logger wrote to csv; a row may lack some of the scalars."""
+    found: dict[str, dict[int, float]] = {}
+    for path in paths:
+        content = cells_of(path, lines_of(path))
+        _, names = next(content, (0, list[str]()))
+        for line, cells in content:
+            row = dict(zip(names, cells))
+            step = row.pop(_STEPS, "")
+            for name in (name for name, cell in row.items() if cell):
+                try:
+                    score = float(row[name]) if name in (METRICS if metric is None else (metric,)) else 0.0
+                    _collect(found, name, whole(step), score, metric, path)
+                except (ValueError, OverflowError):
+                    where = f"{path}, line {line}"
+                    raise FileError(f"{where}: {name} {row[name][:40]!a} at step {step[:40]!a}") from None
+    return _chosen(found, metric, paths[0])
 
 
 def _evaluations(paths: Sequence[Path], metric: str | None) -> Curve:

@@ -316,6 +316,7 @@ def sb3(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs of Stable-Baselines3, with every file that it writes."""
     sb = pytest.importorskip("stable_baselines3")
     import gymnasium
+    from stable_baselines3.common import logger
     from stable_baselines3.common.callbacks import EvalCallback
     from stable_baselines3.common.monitor import Monitor
 
@@ -326,11 +327,13 @@ def sb3(tmp_path_factory: pytest.TempPathFactory) -> Path:
         env, test = (Monitor(gymnasium.make("CartPole-v1"), where) for where in (f"{folder}/", None))
         model = sb.PPO(
             "MlpPolicy", env, n_steps=64, n_epochs=1, seed=3, policy_kwargs={"net_arch": [width]},
-            tensorboard_log=str(folder), device="cpu",
+            device="cpu",
         )  # fmt: skip
+        model.set_logger(logger.configure(str(folder / "PPO_1"), ["csv", "tensorboard"]))
         check = EvalCallback(test, log_path=str(folder), eval_freq=100, n_eval_episodes=2, verbose=0)
         model.learn(256, callback=check)
         model.get_env().close()
+        model.logger.close()
     return logs
 
 
@@ -351,6 +354,25 @@ def test_monitor_files_of_stable_baselines3(sb3: Path) -> None:
     own = found["small", 3]
     assert own.steps.tolist() == np.cumsum(lengths).tolist()
     np.testing.assert_allclose(own.scores, [np.mean(lengths[: k + 1]) for k in range(len(lengths))])
+
+
+def test_progress_files_of_stable_baselines3(sb3: Path, tmp_path: Path) -> None:
+    """They have the scalars of the event files, and rows of training have no evaluation."""
+    files = sorted(sb3.glob("*/*/PPO_1/progress.csv"))
+    found = points.read_files(files)
+    assert sorted(found) == [("large", 1), ("small", 1)]
+    evaluated = np.load(sb3 / "small" / "seed-3" / "evaluations.npz")
+    assert found["small", 1].steps.tolist() == [100, 200]
+    np.testing.assert_allclose(found["small", 1].scores, evaluated["results"].mean(axis=1), rtol=1e-6)
+    assert points.read_files(files, "rollout/ep_rew_mean")["small", 1].steps.tolist() == [64, 128, 192, 256]
+    wrong = tmp_path / "seed-1" / "progress.csv"
+    wrong.parent.mkdir()
+    wrong.write_text("time/total_timesteps,rollout/ep_rew_mean\n64,high\n")
+    with pytest.raises(QrlSuiteError, match=r"line 2: rollout/ep_rew_mean 'high' at step '64'"):
+        points.read_files([wrong])
+    own = tmp_path / "progress.csv"
+    own.write_text("entry,seed,step,score\nmine,1,10,0.5\n")
+    assert list(points.read_files([own])) == [("mine", 1)], "a name alone says nothing"
 
 
 def test_event_files_of_tensorboard(sb3: Path) -> None:

@@ -27,11 +27,11 @@ def import_entries(
         typer.Argument(
             metavar="PATH|OPTION=VALUE",
             help="Results folders, folders that `export` wrote, or entries' folders in them. Or files with the curves "
-            "of other programs: csv (entry,seed,step,score), monitor.csv or evaluations.npz of Stable-Baselines3, "
-            "event files of TensorBoard, *.wandb. Options of files: maximum=BEST, the best possible score, of which "
-            "scores become fractions; metric=NAME, the column or scalar that is the score; for a new task "
-            "thresholds=A,B,..., scores that count as reached, goal=below where less is better, and every=STEPS "
-            "between grid points.",
+            "of other programs: csv (entry,seed,step,score), evaluations.npz, monitor.csv or progress.csv of "
+            "Stable-Baselines3, event files of TensorBoard, *.wandb. Options of files: maximum=BEST, the best "
+            "possible score, of which scores become fractions; metric=NAME, the column or scalar that is the score; "
+            "for a new task thresholds=A,B,..., scores that count as reached, goal=below where less is better, and "
+            "every=STEPS between grid points.",
         ),
     ],
     task: Annotated[
