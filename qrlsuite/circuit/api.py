@@ -140,7 +140,10 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     except Exception as error:
         raise PluginError(f"ansatz '{name}' cannot be built: {own.failure(error)}") from error
     if not isinstance(circuit, Circuit):
-        raise PluginError(f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit")
+        raise PluginError(
+            f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit of qrlsuite.circuit; "
+            "docs/circuits.md#circuits-out-and-in writes a QNode's gates as one"
+        )
     return circuit
 
 

@@ -444,6 +444,8 @@ class RunDisplay:
                 soft_wrap=True,
             )
             return
+        if not summary["seeds"] and not any(state.get("epoch") for state in self._last.values()):
+            return  # nothing was trained that a board or a picture could show
         name = self.entry.task.name
         for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
             self.console.print(

@@ -578,7 +578,9 @@ def test_a_builder_that_fails_is_named_with_its_line() -> None:
         match=r"^ansatz 'worse' cannot be built: AttributeError.*bad.py, line 2: return qubits.foo\)$",
     ):
         resolve("beam6g", "vqc-native ansatz=worse")
-    with pytest.raises(PluginError, match=r"^ansatz 'none' returns NoneType, and must return a Circuit$"):
+    with pytest.raises(
+        PluginError, match=r"^ansatz 'none' returns NoneType, and must return a Circuit of qrlsuite"
+    ):
         resolve("beam6g", "vqc-native ansatz=none")
 
 
