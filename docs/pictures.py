@@ -133,6 +133,10 @@ PICTURES: dict[str, Picture] = {
         "equal-size-frozenlake equal-size-vqe-h2 equal-size-pulse",
         ("plans/equal-size-*", "plans/equal-size-*/*/*"),
     ),
+    "study-equal-size-ppo-tasks.png": Plot(
+        "study draw equal-size-beam6g-ppo equal-size-cartpole-ppo",
+        ("plans/equal-size-*-ppo", "plans/equal-size-*-ppo/*/*"),
+    ),
     "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
     "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),
     "episode-vqe.png": Plot("plot episode seed=2 --task vqe-ising", ()),
@@ -154,6 +158,7 @@ CAPTIONS = {
     "study-quantum-or-not-entries.png": "A study with looks: every entry",
     "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
     "study-equal-size-tasks.png": "Studies of several tasks: every pair, task by task",
+    "study-equal-size-ppo-tasks.png": "The same with PPO, on two of them",
     "study-larger-batch-entries.png": "A study with looks: where models learn in a third of the steps",
     "predictors.png": "Sixteen circuits: how fast they learn, and what was known of them before",
     "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -88,11 +87,10 @@ class StudiesTogether(Shown):
 
     @property
     def name(self) -> str:
-        """The words with which all names of the studies begin, or the first study's name."""
-        names = [study.study.name for study in self.studies]
-        columns = zip(*(name.split("-") for name in names))
-        common = [words[0] for words in takewhile(lambda words: len(set(words)) == 1, columns)]
-        return "-".join(common) or names[0]
+        """The words that are in all names of the studies, as the first has them, or the first study's name."""
+        first, *others = (study.study.name.split("-") for study in self.studies)
+        common = [word for word in first if all(word in other for other in others)]
+        return "-".join(common or first)
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -64,6 +64,9 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
     some = api.read_study("equal-size-pulse", "equal-size-vqe-h2")
     assert isinstance(some, StudiesTogether)
     assert some.name == "equal-size", "the words that names share"
+    some = api.read_study("equal-size-beam6g-ppo", "equal-size-cartpole-ppo")
+    assert isinstance(some, StudiesTogether)
+    assert some.name == "equal-size-ppo"
     [axes] = drawing.draw_together(read).axes
     names = [label.get_text() for label in axes.get_yticklabels()]
     lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}

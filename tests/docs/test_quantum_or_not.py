@@ -231,6 +231,50 @@ def test_the_hours_of_the_searches_of_one_size() -> None:
     assert f"with {sum(tunings.values()):.1f} core-hours in all" in PROSE
 
 
+def test_one_size_with_ppo() -> None:
+    readme = " ".join((DOCS.parent / "README.md").read_text().split())
+    outcomes = {task: tables.published(f"equal-size-{task}-ppo") for task in ("beam6g", "cartpole")}
+    pairs = {(task, pair.second): pair for task, outcome in outcomes.items() for pair in outcome.pairs}
+    winners = {key: pair.verdict for key, pair in pairs.items() if pair.verdict.endswith("needs fewer")}
+    assert winners == {
+        ("beam6g", "network"): "network needs fewer",
+        ("beam6g", "sines"): "sines needs fewer",
+        ("beam6g", "mean-field"): "circuit needs fewer",
+        ("cartpole", "network"): "circuit needs fewer",
+    }
+    said = "both networks of its size beat the circuit, and it beats its mean-field control. On CartPole it beats the"
+    assert f"With PPO on `beam6g`, {said} network alone." in readme
+
+    def numbers(task: str, other: str) -> list[str]:
+        pair = pairs[task, other]
+        ends = (pair.difference, *pair.interval, pair.leading_difference, *pair.leading_interval)
+        return [percent(each) for each in ends]
+
+    def turned(text: str) -> str:
+        return text.removeprefix("-") if text.startswith("-") else f"-{text}"
+
+    for other, words in (
+        ("network", "The network needs {} fewer steps ({} to {}; to reach 0.85, {}, {} to {})"),
+        ("sines", "sines {} fewer ({} to {}; to reach 0.85, {}, {} to {})"),
+    ):
+        mean, low, high, at, least, most = map(turned, numbers("beam6g", other))
+        assert words.format(mean, high, low, at, most, least) in PROSE
+    said = "Mean-field needs {} more ({} to {}; to reach 0.7, {}, {} to {})"
+    assert said.format(*numbers("beam6g", "mean-field")) in PROSE
+    said = "The network needs {} more steps ({} to {}; to reach 0.95, {}, {} to {})"
+    assert said.format(*numbers("cartpole", "network")) in PROSE
+    spans = [", {1} to {2}".format(*numbers("cartpole", other)) for other in ("sines", "mean-field")]
+    means = [numbers("cartpole", other)[0] for other in ("sines", "mean-field")]
+    assert f"({means[0]}{spans[0]}, and {means[1]}{spans[1]})" in PROSE
+    hours = 0.0
+    for task, outcome in outcomes.items():
+        tunings = [entry.tuning for entry in outcome.study.file.entries]
+        hours += sum(tuning.core_hours for tuning in tunings)
+        cells = " | ".join(percent(tuning.regret.expected) for tuning in tunings)
+        assert f"| `{task}` with PPO | {cells} |" in PROSE
+    assert f"Both took {hours:.1f} core-hours" in PROSE
+
+
 def test_ten_qubits() -> None:
     readme = " ".join((DOCS.parent / "README.md").read_text().split())
     outcome = tables.published("ten-qubits")
