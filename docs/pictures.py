@@ -158,7 +158,7 @@ CAPTIONS = {
     "study-quantum-or-not-entries.png": "A study with looks: every entry",
     "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
     "study-equal-size-tasks.png": "Studies of several tasks: every pair, task by task",
-    "study-equal-size-ppo-tasks.png": "The same with PPO, on two of them",
+    "study-equal-size-ppo-tasks.png": "Studies with PPO: every pair on two tasks",
     "study-larger-batch-entries.png": "A study with looks: where models learn in a third of the steps",
     "predictors.png": "Sixteen circuits: how fast they learn, and what was known of them before",
     "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",

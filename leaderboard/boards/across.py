@@ -234,7 +234,7 @@ def shares(
     Parameters
     ----------
     entries:
-        Of these tasks; those of other definitions of a task than most are left out.
+        Of these tasks; those that their own board leaves out have no row.
     tasks:
         In the order of the result.
     horizon:

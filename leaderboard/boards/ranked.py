@@ -56,6 +56,7 @@ def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResult
     """Leave out entries of studies with looks or chosen seeds, and those of another task or world than most.
 
     Another task is another definition of it; another world is other code of its environment, where a plugin makes it.
+    Of two that equally many have, the one whose hash comes first stays.
 
     Returns
     -------
@@ -79,11 +80,11 @@ def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResult
     worlds, edited = [], list[str]()
     for task in sorted({entry.task for entry in kept}):
         members = [entry for entry in kept if entry.task == task]
-        codes = [tuple(sorted(entry.environments)) for entry in members if entry.environments]
-        most = max(sorted(set(codes)), key=codes.count, default=())
+        codes = [code for entry in members for code in entry.environments]
+        most = max(sorted(set(codes)), key=codes.count, default="")
         for entry in members:
-            if entry.environments and tuple(sorted(entry.environments)) != most:
-                of_most = next(other for other in members if tuple(sorted(other.environments)) == most)
+            if entry.environments and most not in entry.environments:
+                of_most = next(other for other in members if most in other.environments)
                 edited.append(f"{entry.folder}: {edited_between(of_most, entry)}")
             else:
                 worlds.append(entry)

@@ -366,7 +366,7 @@ def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
 
 
 def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
-    """Say which entries have curves that another program made, began with trained agents, or had other code."""
+    """Say which entries have curves of another program, began with trained agents, or had another text of a plugin."""
     lines = {
         "curves that other programs made, and nobody here can train or check again": [
             entry.label for entry in entries if entry.external

@@ -57,7 +57,7 @@ def one_task(entries: Sequence[EntryResults], kind: str) -> None:
             )
     for first, entry in itertools.combinations(entries, 2):
         if edited := edited_between(first, entry):
-            raise OptionError(edited)
+            raise OptionError(f"{edited}, or name the entries to draw")
 
 
 def choose_grid(

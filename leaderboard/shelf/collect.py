@@ -290,7 +290,7 @@ def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) 
         folders = [entry.store for entry in everything if entry.key == key]
     copies = [entry for store in folders for entry in read_each(store)]
     if not copies:
-        if any(max(store.seeds(), default=0) >= TUNING_SEEDS for store in folders):
+        if any(min(store.seeds(), default=0) >= TUNING_SEEDS for store in folders):
             raise UnknownNameError(
                 f"entry '{name}' has seeds from {TUNING_SEEDS:,} up alone, which are for trying settings; "
                 "train others: --seeds 20"

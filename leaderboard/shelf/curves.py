@@ -424,11 +424,11 @@ def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
 
 def edited_between(first: EntryResults, second: EntryResults) -> str:
     """Say that two entries of a task saw environments of other code, whose scores mean other things; empty if not."""
-    if len({first.environments, second.environments} - {frozenset()}) < 2:
+    if not first.environments or not second.environments or first.environments & second.environments:
         return ""
     return (
         f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
-        f"'{second.label}': their scores cannot be compared; train one of them again with --fresh"
+        f"'{second.label}': their scores cannot be compared; train the one of the earlier code again with --fresh"
     )
 
 

@@ -282,9 +282,11 @@ def compare(
     compared = compare_entries(left, other, rules.load(rule) if rule else None)
     if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared
-    others, _ = collect.collect(Path(runs), [left.task], published)
+    others, left_out = collect.collect(Path(runs), [left.task], published)
     among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
-    return replace(compared, among=among)
+    places = (f"of the same entry, from {left.folder}", f"of the same entry, from {other.folder}")
+    copies = [f"left out: {line}" for line in left_out if line.endswith(places)]
+    return replace(compared, among=among, remarks=(*compared.remarks, *copies))
 
 
 def plot(

@@ -120,7 +120,7 @@ def seeds_needed(
     UnknownNameError
         If an entry is unknown.
     OptionError
-        If an entry has a single seed, no seed reached a threshold, or they are of different tasks.
+        If an entry has a single seed, no seed of the first reached a threshold, or they are of different tasks.
     """
     names = several(first) if second is None else (first, second)
     entries = [load(name, task=task, runs=runs, published=published) for name in names]
@@ -135,10 +135,10 @@ def seeds_needed(
     horizon = common_horizon(curves[0], curves[-1])
     curves = [each.cut(horizon) for each in curves]
     grid = ranked.ranking_of(entries).grid
-    if all(mean_time(each, grid).at_cap.min() == 1 for each in curves):
+    if mean_time(curves[0], grid).at_cap.min() == 1:
         raise OptionError(
-            f"no seed of {' or '.join(repr(entry.label) for entry in entries)} reached a threshold within {horizon} "
-            "steps, so no number of seeds tells such entries apart: train longer, or change the task's thresholds"
+            f"no seed of '{entries[0].label}' reached a threshold within {horizon} steps, so nothing can be simulated "
+            "that is slower: train longer, change the task's thresholds, or name another entry first"
         )
     per_pair, basis = _core_hours(entries, curves, Path(runs))
     console = Console(stderr=True, quiet=not progress, highlight=False)

@@ -142,7 +142,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     if not isinstance(circuit, Circuit):
         raise PluginError(
             f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit of qrlsuite.circuit; "
-            "docs/circuits.md#circuits-out-and-in writes a QNode's gates as one"
+            "docs/circuits.md#circuits-out-and-in shows how to turn a QNode's gates into one"
         )
     return circuit
 

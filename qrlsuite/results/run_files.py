@@ -245,7 +245,8 @@ def _progress(paths: Sequence[Path], metric: str | None) -> Curve:
         _, names = next(content, (0, list[str]()))
         for line, cells in content:
             row = dict(zip(names, cells))
-            step = row.pop(_STEPS, "")
+            if not (step := row.pop(_STEPS, "")):
+                continue  # of a callback that does not say its steps
             for name in (name for name, cell in row.items() if cell):
                 try:
                     score = float(row[name]) if name in (METRICS if metric is None else (metric,)) else 0.0

@@ -50,7 +50,7 @@ def parse_seeds(text: str) -> list[int]:
             raise OptionError(f"seeds '{text}': {MOST_SEEDS} seeds are the most that an entry takes at once")
         seeds += more
     if not seeds or len(set(seeds)) != len(seeds):
-        one = " (0 is how many; seed 0 alone is 0:1)" if text == "0" else ""
+        one = " (a single number is how many seeds; seed 0 alone is 0:1)" if text == "0" else ""
         raise OptionError(f"seeds '{text}': at least one seed, none twice, is needed{one}")
     return sorted(seeds)
 

@@ -280,7 +280,10 @@ def test_entries_of_an_edited_environment_are_not_compared(tmp_path: Path) -> No
     assert "the code of environment 'walk' was edited between" in left_out
     drawn = qrlsuite("plot", "curves", *words[:4], cwd=tmp_path)
     assert drawn.returncode == 2
-    assert "their scores cannot be compared; train one of them again with --fresh" in drawn.stderr
+    assert (
+        "their scores cannot be compared; train the one of the earlier code again with --fresh"
+        in drawn.stderr
+    )
     assert qrlsuite("run", "mlp width=2", *words, "--fresh", cwd=tmp_path).returncode == 0
     compared = qrlsuite("compare", "mlp width=2", "mlp width=3", *words[:4], cwd=tmp_path)
     assert compared.returncode == 0, compared.stderr

@@ -28,6 +28,7 @@ from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards import board, costs
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
+from qrlsuite.leaderboard.shelf.curves import edited_between
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
@@ -585,6 +586,19 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     entries, refused = collect.collect(tmp_path / "mine", published=True)
     assert [len(entry.seeds) for entry in entries] == [8]
     assert "2 seeds of 3 epochs; shown are 8 seeds of 3 epochs of the same entry, from" in refused[0]
+    other = dataclasses.replace(entries[0], name="another", folder=tmp_path)
+    compared = api.compare(entries[0].name, other, task="tiny", runs=tmp_path / "mine", published=True)
+    assert compared.remarks[-1] == f"left out: {refused[0]}"
+    assert not edited_between(entries[0], other)
+    first, second = (
+        dataclasses.replace(entry, environments=frozenset("ab")) for entry in (entries[0], other)
+    )
+    assert not edited_between(first, dataclasses.replace(second, environments=frozenset("b"))), (
+        "joined by --same"
+    )
+    assert "was edited between" in edited_between(
+        first, dataclasses.replace(second, environments=frozenset("c"))
+    )
     train("short", range(9), 1)
     entries, refused = collect.collect(tmp_path / "short", published=True)
     assert [(entry.curves.shape, "(published)" in entry.label) for entry in entries] == [

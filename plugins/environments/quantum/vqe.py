@@ -313,9 +313,9 @@ class GreedyGate:
 class BestCircuit:
     """The reference policy that plays the best circuit that a beam search finds for each Hamiltonian.
 
-    The search goes on from the 1024 lowest energies of each length, with one circuit each: most circuits of one energy
-    prepare the same state, and would crowd out all others. It reaches the ground states of `vqe-ising`, an optimum, and
-    for `vqe-h2` what all circuits of six gates reach at best. Otherwise it is the best known.
+    The search goes on from the 1024 lowest energies of each length, with one circuit each: circuits of one energy
+    mostly prepare the same state or its mirror image, and would crowd out the others. It reaches the ground states of
+    `vqe-ising` and `vqe-h2`, which are optima. Otherwise it is the best known.
     """
 
     def __init__(self, envs: LaneEnv) -> None:
