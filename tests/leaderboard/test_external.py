@@ -356,43 +356,40 @@ def test_monitor_files_of_stable_baselines3(sb3: Path) -> None:
     np.testing.assert_allclose(own.scores, [np.mean(lengths[: k + 1]) for k in range(len(lengths))])
 
 
-def test_progress_files_of_stable_baselines3(sb3: Path, tmp_path: Path) -> None:
-    """They have the scalars of the event files, and rows of training have no evaluation."""
-    files = sorted(sb3.glob("*/*/PPO_1/progress.csv"))
+@pytest.mark.parametrize("name", ["events*", "progress.csv"])
+def test_scalars_that_stable_baselines3_logs(sb3: Path, name: str) -> None:
+    """A run's folder is called PPO_1, and it is seed 1; evaluations come before training episodes."""
+    pytest.importorskip("tensorboard")
+    files = sorted(sb3.glob(f"*/*/PPO_1/{name}"))
     found = points.read_files(files)
     assert sorted(found) == [("large", 1), ("small", 1)]
     evaluated = np.load(sb3 / "small" / "seed-3" / "evaluations.npz")
     assert found["small", 1].steps.tolist() == [100, 200]
     np.testing.assert_allclose(found["small", 1].scores, evaluated["results"].mean(axis=1), rtol=1e-6)
     assert points.read_files(files, "rollout/ep_rew_mean")["small", 1].steps.tolist() == [64, 128, 192, 256]
-    wrong = tmp_path / "seed-1" / "progress.csv"
-    wrong.parent.mkdir()
-    wrong.write_text("time/total_timesteps,rollout/ep_rew_mean\n64,high\n")
-    with pytest.raises(QrlSuiteError, match=r"line 2: rollout/ep_rew_mean 'high' at step '64'"):
-        points.read_files([wrong])
-    own = tmp_path / "progress.csv"
-    own.write_text("entry,seed,step,score\nmine,1,10,0.5\n")
-    assert list(points.read_files([own])) == [("mine", 1)], "a name alone says nothing"
-
-
-def test_event_files_of_tensorboard(sb3: Path) -> None:
-    """A run's folder is called PPO_1, and it is seed 1; evaluations come before training episodes."""
-    pytest.importorskip("tensorboard")
-    events = sorted(sb3.glob("*/*/PPO_1/events*"))
-    found = points.read_files(events)
-    assert sorted(found) == [("large", 1), ("small", 1)]
-    evaluated = np.load(sb3 / "small" / "seed-3" / "evaluations.npz")
-    assert found["small", 1].steps.tolist() == [100, 200]
-    np.testing.assert_allclose(found["small", 1].scores, evaluated["results"].mean(axis=1), rtol=1e-6)
-    assert points.read_files(events, "rollout/ep_rew_mean")["small", 1].steps.tolist() == [64, 128, 192, 256]
     with pytest.raises(
         QrlSuiteError, match=r"name the scalar that is the score with metric=NAME; found .*eval/mean_reward"
     ):
-        points.read_files(events, "reward")
-    torn = events[0].parent / "events.out.tfevents.torn"
+        points.read_files(files, "reward")
+
+
+def test_event_files_without_records(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    torn = tmp_path / "seed-1" / "events.out.tfevents.torn"
+    torn.parent.mkdir()
     torn.write_bytes(b"no records")
     with pytest.raises(QrlSuiteError, match="name the scalar that is the score"):
         points.read_files([torn])
+
+
+def test_progress_files_are_told_by_their_columns(tmp_path: Path) -> None:
+    path = tmp_path / "seed-1" / "progress.csv"
+    path.parent.mkdir()
+    path.write_text("time/total_timesteps,note,rollout/ep_rew_mean\n,a callback,\n32,,5\n64,,high\n")
+    with pytest.raises(QrlSuiteError, match=r"line 4: rollout/ep_rew_mean 'high' at step '64'"):
+        points.read_files([path])
+    path.write_text("entry,seed,step,score\nmine,1,10,0.5\n")
+    assert list(points.read_files([path])) == [("mine", 1)], "a name alone says nothing"
 
 
 def test_offline_files_of_wandb(tmp_path: Path) -> None:
