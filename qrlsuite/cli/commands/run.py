@@ -156,7 +156,7 @@ def _of_its_size(circuit: Entry, task: str, written: Written, words: list[str], 
         return resolve(task, Written(model, written.algorithm, (*kept, width_of), written.preset))
 
     found = network(nearest_size(network, circuit))
-    counts = f"{parameters(found)} and {parameters(circuit)} parameters"
+    counts = f"{parameters(found)} parameters, the circuit has {parameters(circuit)}"
     entry = [*split(found.label), *(write_setting(f"environment.{s.name}", s.value) for s in world)]
     return f"a network of its size ({counts}): {command('run', *entry, '--task', task, *words, runs=runs)}"
 
