@@ -96,7 +96,7 @@ def compose(
         return Composed(pictures.draw(kind, (), **settings))
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
-    collect.check_tasks(runs, tasks, published)
+    tasks = collect.task_names(runs, tasks, published)
     selected, left_out = collect.select(runs, tasks, entries, published, horizon)
     if seeds is not None:
         wanted = read_seeds(seeds)

@@ -116,15 +116,17 @@ def _as_published(entry: EntryResults) -> EntryResults:
     return replace(entry, name=f"{entry.name}{BESIDE}", label=f"{entry.label} (published)")
 
 
-def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
-    """Refuse a task that is neither registered nor has entries here, or among the published ones where they count.
+def task_names(runs: Path, tasks: Collection[str], published: bool = False) -> list[str]:
+    """Return the names of tasks, of a task file by its path: registered, or with entries here or published ones.
 
     Raises
     ------
     UnknownNameError
         With the nearest name.
+    FileError
+        If a task file cannot be read or is malformed.
     """
-    lookup.check_tasks(runs, *tasks, also=published_entries.folders() if published else ())
+    return lookup.task_names(runs, tasks, also=published_entries.folders() if published else ())
 
 
 def select(

@@ -67,8 +67,7 @@ def load(
     (100, 100)
     """
     folder = Path(runs)
-    collect.check_tasks(folder, several(task), published)
-    return collect.find(folder, entry, published, several(task))
+    return collect.find(folder, entry, published, collect.task_names(folder, several(task), published))
 
 
 def board(
@@ -140,8 +139,8 @@ def board(
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
-    folder, task_names = Path(runs), several(task)
-    collect.check_tasks(folder, task_names, published)
+    folder = Path(runs)
+    task_names = collect.task_names(folder, several(task), published)
     together = task_names if len(task_names) > 1 else ()
     if rule is not None and (together or by != "steps"):
         other = "several tasks" if together else f"by = '{by}'"
@@ -201,6 +200,7 @@ def write_page(
     from qrlsuite.leaderboard import report
     from qrlsuite.leaderboard.shelf import published_studies
 
+    tasks = collect.task_names(runs, tasks, published)
     asked |= {"runs": runs, "published": published, "study": study}
     beside = None if len(tasks) < 2 and by == "steps" else board(tasks, by=by, **asked)
     shown = [board(names, **asked) for names in [[task] for task in tasks] or [[]]]

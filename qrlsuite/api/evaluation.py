@@ -245,7 +245,7 @@ def the_task(runs: Path, name: str, published: bool = False) -> Task:
     registered = name.endswith(".toml") or name in registry.load().of(specs.TaskSpec)
     if registered:
         return load(name)
-    collect.check_tasks(runs, [name], published)
+    collect.task_names(runs, [name], published)
     for folder in (runs, *(published_entries.folders() if published else ())):
         if folder.is_dir() and (stores := entries(folder, name)):
             return stores[0].entry().task

@@ -21,7 +21,6 @@ from qrlsuite.leaderboard.shelf.changed import changed
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.notation import parse_named
-from qrlsuite.results import lookup
 from qrlsuite.results.store import write_atomically
 from qrlsuite.specs import StudySpec
 from qrlsuite.studies.looks import StudyWithLooks
@@ -106,7 +105,7 @@ def export(
             folder = published_studies.export(StudyWithLooks(study, runs), target, agents)
             yield Exported(folder=folder)
         return
-    lookup.check_tasks(runs, *tasks)
+    tasks = collect.task_names(runs, tasks)
     if everything or named:
         chosen = [studies.select(name, runs, tasks) for name in named] or [collect.collect(runs, tasks)]
         selected = list({entry.folder: entry for entries, _ in chosen for entry in entries}.values())
@@ -145,7 +144,7 @@ def export_rliable(file: Path, tasks: Sequence[str], names: Sequence[str], runs:
     """
     if len(tasks) < 2:
         raise OptionError(f"--out {file}: name two tasks or more, as --task A --task B")
-    collect.check_tasks(runs, tasks)
+    tasks = collect.task_names(runs, tasks)
     entries, refused = across.collected(tasks, lambda task: collect.select(runs, [task], names))
     shares = across.shares(entries, tasks, refused=refused)
     arrays: dict[str, Any] = shares.rliable()

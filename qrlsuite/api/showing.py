@@ -14,7 +14,7 @@ from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import catalog, identity
-from qrlsuite.experiment.task import is_quick
+from qrlsuite.experiment.task import is_quick, name_in
 from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.leaderboard.pictures import compose
 from qrlsuite.leaderboard.shelf import collect, published_studies
@@ -81,9 +81,8 @@ def describe(
         among = [specs.StudySpec]
     known = registry.load()
     found = [each for each in among if name in known.of(each)]
-    if (among == [specs.TaskSpec] and is_quick(name)) or (
-        name.startswith("gym:") and specs.TaskSpec in among
-    ):
+    of_file = name.startswith("gym:") or name.endswith(".toml")
+    if (among == [specs.TaskSpec] and is_quick(name)) or (of_file and specs.TaskSpec in among):
         found = [specs.TaskSpec]
     if specs.StudySpec in (*found[:1], *among[:1]) and len(found) < 2:
         from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
@@ -118,7 +117,9 @@ def describe(
 
 def is_study(name: str) -> bool:
     """Return whether a name can only be a study's: that of its file, or of a published one or its folder."""
-    return name.endswith(".toml") or published_studies.folder_of(name) is not None
+    if name.endswith(".toml"):
+        return name_in(Path(name)) is None
+    return published_studies.folder_of(name) is not None
 
 
 def _ansatz(

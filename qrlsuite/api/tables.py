@@ -84,8 +84,8 @@ def table(
     """
     if rows not in fields.FIELDS:
         raise OptionError(f"rows = {rows!r}: a row is one of the entries, seeds or epochs")
-    folder, names = Path(runs), several(task)
-    collect.check_tasks(folder, names, published)
+    folder = Path(runs)
+    names = collect.task_names(folder, several(task), published)
     found, left_out = collect.select(folder, names, entries, published, horizon)
     for line in left_out:
         warnings.warn(f"left out: {line}", stacklevel=2)

@@ -16,7 +16,9 @@ from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import again, command, printable
 from qrlsuite.engine.work import Missing
 from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.results import lookup
 from qrlsuite.results.seeds import SeedGroup
+from qrlsuite.results.store import entries
 from qrlsuite.results.survey import GroupStatus
 from qrlsuite.results.text import counted, duration
 
@@ -447,6 +449,14 @@ class RunDisplay:
         if not summary["seeds"] and not any(state.get("epoch") for state in self._last.values()):
             return  # nothing was trained that a board or a picture could show
         name = self.entry.task.name
+        stored = lookup.stored(entries(self.missing.runs, name))
+        if others := sum(each.key[1] not in ("", self.entry.task.hash) for each in stored):
+            self.console.print(
+                f"another definition of task '{name}' has {counted(others, 'entry')} here: boards and "
+                "pictures show the definition with the most entries (qrlsuite runs rm ENTRY deletes one)",
+                markup=False,
+                soft_wrap=True,
+            )
         for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
             self.console.print(
                 f"next: {command(*arguments, runs=self.missing.runs)}", markup=False, soft_wrap=True

@@ -61,10 +61,10 @@ def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
     StoreError
         If there is no such folder.
     """
-    lookup.check_tasks(runs, task)
+    name = lookup.task_name(runs, task)
     statuses = []
     queues = Queues()
-    for store in entries(runs, task):
+    for store in entries(runs, name):
         entry, queued, problem = look(store), None, None
         if entry.seeds.get("submitted"):
             try:
@@ -84,7 +84,7 @@ def choose(runs: Path, names: Sequence[str], task: str | None = None) -> list[En
     UnknownNameError
         If there is no such task, or none or several entries have a name.
     """
-    lookup.check_tasks(runs, task)
+    task = lookup.task_name(runs, task)
     stored = lookup.stored(entries(runs, task))
     searched = f"{runs}, task {task}" if task else runs
     return [

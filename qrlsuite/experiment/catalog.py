@@ -16,6 +16,8 @@ def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
     if kind is specs.TaskSpec and is_quick(name):
         source = "gymnasium" if name.startswith("gym:") else _source(name)
         return {"kind": "task", "name": name, "distribution": source} | _task(name)
+    if kind is specs.TaskSpec and name.endswith(".toml"):
+        return {"kind": "task", "name": load(name).name, "path": name} | _task(name)
     registered = registry.load().get(kind, name)
     spec = registered.spec
     content: dict[str, Any] = {
@@ -38,7 +40,8 @@ def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
 def task_file(name: str) -> str:
     """Return a task as the text of its file; of one that no file has, as one that may be saved and changed."""
     if not is_quick(name):
-        return Path(registry.get(specs.TaskSpec, name).path).read_text(encoding="utf-8")
+        path = name if name.endswith(".toml") else registry.get(specs.TaskSpec, name).path
+        return Path(path).read_text(encoding="utf-8")
     return tomli_w.dumps(load(name).file.model_dump(mode="json", exclude_unset=True))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -539,5 +540,28 @@ def load(name: str) -> Task:
         qrlsuite.register_environments()
         gymnasium_id = registry.get(specs.EnvironmentSpec, name).gymnasium_id
         return Task(TaskFile.model_validate(quick_task(gymnasium_id, name)), name)
-    path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.TaskSpec, name).path)
+    path = Path(name) if name.endswith(".toml") else _registered(name)
     return parse(files.read(path, "task file"), path.name, path.parent)
+
+
+def _registered(name: str) -> Path:
+    """Return a registered task's file; the error names the file in the current folder that has the task."""
+    try:
+        return Path(registry.get(specs.TaskSpec, name).path)
+    except UnknownNameError as error:
+        for path in sorted(Path().glob("*.toml")):
+            if name_in(path) == name:
+                raise UnknownNameError(
+                    f"task '{name}' is not registered, but a file has it: write {path}"
+                ) from None
+        raise UnknownNameError(f"{error}; of a task file, write the path: FILE.toml") from None
+
+
+def name_in(path: Path) -> str | None:
+    """Return the name of the task that a file defines; None if the file is no task file."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    name = content.get("name")
+    return name if "environment" in content and isinstance(name, str) else None

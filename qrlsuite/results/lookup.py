@@ -11,6 +11,7 @@ from typing import Protocol, TypeVar
 from qrlsuite import notation, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed, nearest
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.experiment.task import load
 from qrlsuite.results.store import EntryStore
 
 
@@ -66,8 +67,13 @@ def stored(stores: Iterable[EntryStore]) -> list[Stored]:
     return entries
 
 
-def check_tasks(runs: Path, *tasks: str | None, also: Iterable[Path] = ()) -> None:
-    """Refuse the name of a task that is neither registered nor has a folder of results; None names no task.
+def task_name(runs: Path, task: str | None) -> str | None:
+    """Return the name of a task as `task_names` does; None is no task."""
+    return None if task is None else task_names(runs, [task])[0]
+
+
+def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> list[str]:
+    """Return the names of tasks: as they are written, or that of the task file whose path is written.
 
     Parameters
     ----------
@@ -77,16 +83,18 @@ def check_tasks(runs: Path, *tasks: str | None, also: Iterable[Path] = ()) -> No
     Raises
     ------
     UnknownNameError
-        With the nearest name, or what there is.
+        With the nearest name, or what there is, if a task is neither registered nor has a folder of results.
+    FileError
+        If a task file cannot be read or is malformed.
     """
     folders = [folder for folder in (runs, *also) if folder.is_dir()]
     held = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
-    for name in tasks:
-        if name is None or name in held:
-            continue
+    names = [load(name).name if name.endswith(".toml") else name for name in tasks]
+    for name in names:
         known = registry.load().of(specs.TaskSpec)
-        if name not in known:
+        if name not in held and name not in known:
             raise UnknownNameError(f"unknown task '{name}'{nearest(name, {*known, *held})}")
+    return names
 
 
 def choose(among: Sequence[N], name: str, searched: object) -> N:

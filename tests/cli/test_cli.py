@@ -33,6 +33,25 @@ def task(tmp_path: Path) -> str:
     return str(path)
 
 
+def test_a_run_says_where_entries_have_another_definition_of_its_task(task: str, tmp_path: Path) -> None:
+    words = (
+        "run",
+        "mlp",
+        "width=4",
+        "--task",
+        task,
+        "--seeds",
+        "1",
+        "--epochs",
+        "1",
+        "--runs",
+        str(tmp_path),
+    )
+    assert "another definition" not in qrlsuite(*words).stderr
+    Path(task).write_text(TINY.replace("validation_episodes = ", "validation_episodes = 1"))
+    assert "another definition of task 'tiny' has 1 entry here" in qrlsuite(*words).stderr
+
+
 def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
     for width in ("16", "8"):
@@ -51,6 +70,16 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
         "seeds from 1,000,000 up are for trying settings: boards and pictures leave them out" in tried.stderr
     )
     assert "next:" not in tried.stderr
+
+    # a task file's path says which task, as its name does
+    for text in ("leaderboard --format json", "runs --json", "compare 'mlp width=8' 'mlp width=16' --json"):
+        by_path, by_name = (
+            json.loads(say(*shlex.split(text), "--runs", runs, "--task", name).stdout)
+            for name in (task, "tiny")
+        )
+        assert by_path == by_name
+    assert "name: tiny\n" in say("show", task).stdout
+    assert say("show", task, "--format", "toml").stdout == TINY
 
     assert "undecided: fewer than 20 seeds" in qrlsuite("leaderboard", "--runs", runs).stdout
     (section,) = json.loads(say("leaderboard", "--runs", runs, "--format", "json").stdout)["sections"]
@@ -281,7 +310,8 @@ show ansatz iqp cx => ansatz iqp cx: give one name
 show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
 show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
 show ansatz iqp --qubits 4 => --qubits is gone: write it after the name
-show tiny.toml => tiny.toml: unknown key 'default_algorithm'
+run mlp --task tiny => task 'tiny' is not registered, but a file has it: write tiny.toml
+run mlp --task gone => unknown task 'gone'
 show bar.toml => pictures.0.kind: unknown picture 'bar'; did you mean 'bars'
 show many.toml => many.toml: pictures.0.settings
 show episodes.toml => pictures.0.evaluation: picture 'histogram' needs evaluation

@@ -96,10 +96,10 @@ def test_long_lists_are_cut() -> None:
 
 def test_a_task_is_known_by_registration_or_by_its_results(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    lookup.check_tasks(tmp_path, "mine", "beam6g", None)
-    lookup.check_tasks(tmp_path / "nowhere", "beam6g")
+    assert lookup.task_names(tmp_path, ["mine", "beam6g"]) == ["mine", "beam6g"]
+    assert lookup.task_names(tmp_path / "nowhere", ["beam6g"]) == ["beam6g"]
     with pytest.raises(UnknownNameError, match="unknown task 'mime'; did you mean 'mine'"):
-        lookup.check_tasks(tmp_path, "mine", "mime")
+        lookup.task_names(tmp_path, ["mine", "mime"])
 
 
 def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:

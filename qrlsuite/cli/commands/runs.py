@@ -89,7 +89,7 @@ def collect_garbage(
 
     Example: qrlsuite runs gc --yes
     """
-    lookup.check_tasks(runs, task)
+    task = lookup.task_name(runs, task)
     items, problems = garbage(runs, task)
     total = sum(item.size for item in items)
     freed = remove(items) if yes else 0
