@@ -184,6 +184,7 @@ def read(path: str | os.PathLike[str]) -> Source:
     """
     shown, place = os.fspath(path), Path(os.path.abspath(path))
     if place.is_dir():
+        place = _package(shown, place)
         files = _folder(shown, place)
     elif place.suffix != ".py":
         raise PluginError(_no_plugin(shown, place))
@@ -208,11 +209,19 @@ def _no_plugin(shown: str, place: Path) -> str:
     return f"plugin {shown}: give a Python file, or the folder of a package (the one with __init__.py)"
 
 
+def _package(shown: str, place: Path) -> Path:
+    """Return the folder of the package: the one that is given, or the only one in `src` of a project's folder."""
+    if (place / "__init__.py").is_file():
+        return place
+    inner = sorted(path.parent for path in place.glob("src/*/__init__.py"))
+    if len(inner) == 1:
+        return inner[0]
+    inner += sorted(path.parent for path in place.glob("*/__init__.py"))
+    near = f"; did you mean {os.path.join(shown, inner[0].relative_to(place))}?" if inner else ""
+    raise PluginError(f"plugin {shown} is no package: it has no __init__.py{near}")
+
+
 def _folder(shown: str, place: Path) -> dict[str, bytes]:
-    if not (place / "__init__.py").is_file():
-        inner = sorted(p.parent for p in [*place.glob("*/__init__.py"), *place.glob("src/*/__init__.py")])
-        near = f"; did you mean {os.path.join(shown, inner[0].relative_to(place))}?" if inner else ""
-        raise PluginError(f"plugin {shown} is no package: it has no __init__.py{near}")
     found: dict[str, bytes] = {}
     for folder, folders, names in os.walk(place):
         folders[:] = sorted(each for each in folders if each != "__pycache__" and not each.startswith("."))

@@ -223,8 +223,8 @@ class PairVerdict:
         means = f"{one:{digits}} against {other:{digits}}"
         p = "" if self.times.direction is Direction.UNDECIDED else f", {p_text(float(self.scores.p[0, 1]))}"
         return (
-            f"final {self.score_name}: {means}, difference {self.scores.difference[0, 1]:+.2g} "
-            f"({low:+.2g} to {high:+.2g}{p}); mean over the last tenth of the epochs ({self.n_last})"
+            f"final {self.score_name}: {means}, difference {_signed(self.scores.difference[0, 1])} "
+            f"({_signed(low)} to {_signed(high)}{p}); mean over the last tenth of the epochs ({self.n_last})"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -411,6 +411,11 @@ def _difference(values: FloatArray) -> str:
         return "-"
     texts = [percent(each) for each in values.tolist()]
     return texts[0] if np.isnan(values[1]) else f"{texts[0]} ({texts[1]} to {texts[2]})"
+
+
+def _signed(value: float) -> str:
+    """Write a difference of scores with two digits or more: `+0.012`, `-3.4`, `+12.5`, `+130`."""
+    return f"{value:+.0f}" if abs(value) >= 100 else f"{value:+.1f}" if abs(value) >= 10 else f"{value:+.2g}"
 
 
 def p_text(p: float) -> str:

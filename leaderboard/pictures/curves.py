@@ -40,7 +40,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     cells.one_task(entries, "curves")
     many = len(entries) > MANY
     beside = 0.7 + 0.07 * max(len(style.label(entry)) for entry in entries)
-    size = (7.2 + beside, max(4.3, 0.6 + 0.19 * len(entries))) if many else (7.2, 4.3)
+    size = (7.2 + beside, max(4.3, 0.6 + 0.19 * len(entries))) if many else (7.2, 4.3 + 0.19 * len(entries))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other
@@ -72,10 +72,10 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     title = f"{entries[0].task}: median of the runs{'' if many else ', 5th to 95th percentile'}"
     axes.set_title(title, fontsize="medium", loc="left")
     legend = {"frameon": False, "title": style.note(entries) or None, "title_fontsize": "small"}
-    if many:  # in the order in which the lines lie one above the other
-        handles = [line for _, line in sorted(lines, key=lambda each: -each[0])]
+    # beside or below the curves, never on them, in the order in which they lie one above the other
+    handles = [line for _, line in sorted(lines, key=lambda each: -each[0])]
+    if many:
         figure.legend(handles=handles, loc="outside right upper", fontsize=8, alignment="left", **legend)
     else:
-        rising = entries[0].task_file.score.sign > 0
-        axes.legend(loc="lower right" if rising else "upper right", **legend)
+        figure.legend(handles=handles, loc="outside lower left", fontsize=8, alignment="left", **legend)
     return figure

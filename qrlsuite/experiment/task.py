@@ -318,7 +318,7 @@ class Task:
         try:
             self.environment = registry.get(specs.EnvironmentSpec, file.environment.name)
         except UnknownNameError as error:
-            raise FileError(f"{source}: environment.name: {error}") from None
+            raise UnknownNameError(f"{source}: environment.name: {error}") from None
         cls = specs.resolve(self.environment.options)
         location = f"{source}: environment.options"
         self.environment_options = options.build(cls, file.environment.options, location)

@@ -289,6 +289,19 @@ def test_entries_of_an_edited_environment_are_not_compared(tmp_path: Path) -> No
     assert compared.returncode == 0, compared.stderr
 
 
+def test_a_projects_folder_means_its_package_and_agents_say_where_its_copy_is(tmp_path: Path) -> None:
+    (tmp_path / "acme/src/walk").mkdir(parents=True)
+    (tmp_path / "acme/src/walk/__init__.py").write_text(WALK)
+    words = ("run", "mlp width=2", "--task", "walk", "--seeds", "1", "--epochs", "1", "--workers", "1")
+    done = qrlsuite(*words, "--plugin", "acme", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    asked = ("evaluate", "mlp width=2", "--task", "walk", "--episodes", "1")
+    refused = qrlsuite(*asked, cwd=tmp_path)
+    assert refused.returncode == 2
+    copy = refused.stderr.split("if you trust it, add --plugin ")[1].strip()
+    assert qrlsuite(*asked, "--plugin", copy, cwd=tmp_path).returncode == 0
+
+
 def test_a_control_of_a_circuit_without_one_is_refused_with_the_page(folder: Path) -> None:
     said = run(folder, entry=f"{ENTRY} entangled=mean-field", code=2)
     assert "give its function a parameter `entangled`: docs/controls.md" in said

@@ -80,6 +80,12 @@ def test_two_that_reached_nothing_are_told_what_to_do() -> None:
     said = compare_entries(first, second).verdict
     assert said == "neither reached any of the 7 thresholds within 200k steps: train longer, or lower them"
     assert "difference +0.3 (+0.3 to +0.3, p < .0001)" in compare_entries(first, second).pair.final
+    assert [pair._signed(value) for value in (130.4, -99.6, -3.44, 0.0123)] == [
+        "+130",
+        "-99.6",
+        "-3.4",
+        "+0.012",
+    ]
 
 
 def test_equals_are_not_told_apart_and_few_are_undecided() -> None:
