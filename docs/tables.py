@@ -141,7 +141,11 @@ PAIRS: dict[str, tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = {
         ("Do gates on two qubits help?", (("iqp", "iqp separable"), ("jerbi", "jerbi separable"))),
         ("Do larger networks need fewer steps?", (("iqp", "width 16"), ("iqp", "width 64"))),
     )
-    for task, networks in (("vqe-h2", ("width 6",)), ("pulse", ("width 8", "sines")))
+    for task, networks in (
+        ("vqe-h2", ("width 6",)),
+        ("pulse", ("width 8", "sines")),
+        ("vqe-ising", ("width 5", "sines")),
+    )
 }
 """The pairs of boards of small circuits that answer a question, by short names of the entries."""
 

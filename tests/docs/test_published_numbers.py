@@ -92,3 +92,36 @@ def test_what_the_board_of_pulse_took() -> None:
     spent = [float(row["core_hours"]) for row in section.as_dict()["rows"]]
     hours = sum(tuning["core_hours"] for tuning in tunings)
     assert f"It took {hours:.2f} core-hours, and the 500 runs {sum(spent):.2f}." in text
+
+
+def test_what_the_board_of_three_spins_says() -> None:
+    text = " ".join(PAGE.partition("\n## Three spins\n")[2].partition("\n## ")[0].split())
+    records = [
+        json.loads(path.read_text()) for path in sorted((PUBLISHED / "vqe-ising").glob("*/entry.json"))
+    ]
+    tunings = [record["tuning"] for record in records]
+    reached = [t["budget"] == "expected regret 3%" for t in tunings]
+    assert sum(reached) == 2
+    late = [t for t, done in zip(tunings, reached) if not done]
+    regrets = [round(100 * t["regret"]["expected"]) for t in late]
+    assert f"were stopped at {min(regrets)} to {max(regrets)} percent" in text
+    runs = [t["runs"] for t in late]
+    assert f"after {min(runs)} to {max(runs)} runs each" in text
+    [section] = api.board("vqe-ising", published=True, runs="none").sections
+    rows = section.as_dict()["rows"]
+    spent, hours = sum(float(row["core_hours"]) for row in rows), sum(t["core_hours"] for t in tunings)
+    assert f"The searches took {hours:.2f} core-hours, the 500 runs {spent:.2f}." in text
+
+    def called(words: str) -> str:
+        (found,) = (row["label"] for row in rows if row["label"].startswith(f"ppo {words}"))
+        return str(found)
+
+    sines, width = called("mlp width=5 activation=sin "), called("mlp width=5 input_scale")
+    said = api.compare(sines, width, task="vqe-ising", published=True, runs="none").verdict
+    assert "needs 33% fewer steps" in said
+    assert "(27% to 38%, 50 seeds each" in said
+    assert "with sines it needs 33% fewer steps (27% to 38%)" in text
+    for circuit in ("vqc-native model.qubits=4 init", "vqc-native model.qubits=4 layers=5 ansatz=jerbi init"):
+        (record,) = (each for each in records if each["label"] == called(circuit))
+        assert record["identity"]["algorithm_options"]["quantum_lr"] < 1e-4
+        assert record["identity"]["algorithm_options"]["lr"] <= 0.03
