@@ -135,16 +135,17 @@ PAIRS: dict[str, tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = {
     task: (
         (
             f"Does a circuit beat {'the network' if len(networks) == 1 else 'networks'} of its size?",
-            tuple((circuit, network) for circuit in ("iqp", "jerbi") for network in networks),
+            tuple((circuit, network) for circuit in circuits for network in networks),
         ),
-        ("Does entanglement help?", (("iqp", "iqp mean-field"), ("jerbi", "jerbi mean-field"))),
-        ("Do gates on two qubits help?", (("iqp", "iqp separable"), ("jerbi", "jerbi separable"))),
+        ("Does entanglement help?", tuple((circuit, f"{circuit} mean-field") for circuit in circuits)),
+        ("Do gates on two qubits help?", tuple((circuit, f"{circuit} separable") for circuit in circuits)),
         ("Do larger networks need fewer steps?", (("iqp", "width 16"), ("iqp", "width 64"))),
     )
-    for task, networks in (
-        ("vqe-h2", ("width 6",)),
-        ("pulse", ("width 8", "sines")),
-        ("vqe-ising", ("width 5", "sines")),
+    for task, circuits, networks in (
+        ("vqe-h2", ("iqp", "jerbi"), ("width 6",)),
+        ("pulse", ("iqp", "jerbi"), ("width 8", "sines")),
+        ("vqe-ising", ("iqp", "jerbi"), ("width 5", "sines")),
+        ("clifford", ("iqp",), ("width 6", "tanh", "sines")),
     )
 }
 """The pairs of boards of small circuits that answer a question, by short names of the entries."""
@@ -154,7 +155,8 @@ def _short(label: str) -> str:
     """Name an entry of these boards: `width 6`, `sines`, `jerbi mean-field`."""
     words = label.split()
     if "mlp" in words:
-        return "sines" if "activation=sin" in words else words[2].replace("=", " ")
+        activation = next((word.partition("=")[2] for word in words if word.startswith("activation=")), "")
+        return {"": words[2].replace("=", " "), "sin": "sines"}.get(activation, activation)
     control = next((word.partition("=")[2] for word in words if word.startswith("entangled=")), "")
     return f"{'jerbi' if 'ansatz=jerbi' in words else 'iqp'} {control}".strip()
 

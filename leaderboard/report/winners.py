@@ -62,9 +62,10 @@ class Winners:
 
 
 def winners(rows: Sequence[RowView], ranking: TimeRanking) -> Winners:
-    """Return who wins on a board; `rows` are in its order."""
+    """Return who wins on a board; `rows` are in its order. Controls without entanglement are no circuits here."""
     ranked = _ranked(rows)
-    networks, circuits = ([row for row in ranked if row.kind == kind] for kind in (NETWORK, CIRCUIT))
+    networks = [row for row in ranked if row.kind == NETWORK]
+    circuits = [row for row in ranked if row.kind == CIRCUIT and not row.entry.curves.control]
     circuit, sized = next(iter(circuits), None), None
     if circuit is not None:
         sized = min(networks, key=lambda row: _apart(row, circuit), default=None)

@@ -356,6 +356,13 @@ class EntryResults(Shown):
         return f"{self.label} ansatz={ansatz}"
 
     @property
+    def control(self) -> bool:
+        """Whether it is a circuit whose qubits are not entangled: a classical control, see docs/controls.md."""
+        options = self.identity.get("model_options", {})
+        kept = {**options, **_mapping(options.get("ansatz_options"))}
+        return kept.get("entangled") in ("separable", "mean-field")
+
+    @property
     def longest(self) -> int:
         """The epochs of the longest run."""
         return max((len(curve) for curve in self.runs.values()), default=int(self.curves.shape[1]))

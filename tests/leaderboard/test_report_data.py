@@ -188,10 +188,15 @@ def test_boards_are_counted_and_a_circuit_is_set_against_the_network_of_its_size
             dataclasses.replace(each, parameters=(n, 0))
             for each, n in zip(made, (1000, 90, 110), strict=True)
         ]
-        return [
-            *made,
-            dataclasses.replace(boards.entry("vqc", speed=circuit, task=task), parameters=(60, 40)),
+        circuits = [
+            dataclasses.replace(boards.entry(f"vqc{n}", speed=v, task=task), parameters=(60, 40))
+            for n, v in ((0, circuit), (1, 9), (2, 9))
         ]
+        for each, at in zip(circuits, (None, "model_options", "ansatz_options")):
+            control = {"entangled": "separable" if at == "model_options" else "mean-field"}
+            if at is not None:
+                each.identity["model_options"] = control if at == "model_options" else {at: control}
+        return [*made, *circuits]
 
     board = boards.of([*drawn("beam6g", 1.6), *drawn("cartpole", 0.5)])
     shown = entries.views([row.entry for section in board.sections for row in section.rows])
