@@ -206,7 +206,10 @@ def _no_plugin(shown: str, place: Path) -> str:
         return f"there is no plugin {shown}" + (f"; did you mean {near.name}?" if near.is_file() else "")
     if place.suffix == ".ipynb":
         return f"plugin {shown} is a notebook: call qrlsuite.register in a cell of it, or save the cell as a .py file"
-    return f"plugin {shown}: give a Python file, or the folder of a package (the one with __init__.py)"
+    return (
+        f"plugin {shown}: give a Python file, or the folder of a package (the one with __init__.py) or of a project "
+        "with one package in src"
+    )
 
 
 def _package(shown: str, place: Path) -> Path:
@@ -219,6 +222,15 @@ def _package(shown: str, place: Path) -> Path:
     inner += sorted(path.parent for path in place.glob("*/__init__.py"))
     near = f"; did you mean {os.path.join(shown, inner[0].relative_to(place))}?" if inner else ""
     raise PluginError(f"plugin {shown} is no package: it has no __init__.py{near}")
+
+
+def _package_of(folder: Path | None, path: str) -> str:
+    """Return the name of the package that a project's folder has; that of the path where it is none."""
+    place = (folder or Path()) / path
+    try:
+        return _package(path, place).name if place.is_dir() else place.name
+    except PluginError:
+        return place.name
 
 
 def _folder(shown: str, place: Path) -> dict[str, bytes]:
@@ -288,7 +300,7 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
     for path in paths:
         if not beside_results:
             load(os.path.relpath(folder / path) if folder is not None else path)
-        elif Path(path).name not in _own().loaded:
+        elif not {Path(path).name, _package_of(folder, path)} & _own().loaded.keys():
             raise FileError(
                 f"{source}: plugins: what lies beside results is not imported on the word of a file there; if you "
                 f"trust it, add --plugin {os.path.join(folder or '', path)}"

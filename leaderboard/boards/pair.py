@@ -414,7 +414,7 @@ def _difference(values: FloatArray) -> str:
 
 
 def _signed(value: float) -> str:
-    """Write a difference of scores with two digits or more: `+0.012`, `-3.4`, `+12.5`, `+130`."""
+    """Write a difference of scores, from 10 up without a power of ten: `+0.012`, `-3.4`, `+12.5`, `+130`."""
     return f"{value:+.0f}" if abs(value) >= 100 else f"{value:+.1f}" if abs(value) >= 10 else f"{value:+.2g}"
 
 

@@ -84,7 +84,7 @@ def compose(
         name = next(name for name, value in selection.items() if value)
         raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
     if spec is not None:
-        return Composed(_of_environment(kind, spec, tasks, settings, environment), tasks=tuple(tasks))
+        return _of_environment(kind, spec, tasks, settings, environment)
     if environment:
         raise OptionError(f"environment.{next(iter(environment))}: picture '{kind}' shows what was trained")
     data = pictures.KINDS[kind].data
@@ -193,7 +193,7 @@ def find(kind: str, tasks: Sequence[str]) -> PictureSpec | None:
 
 def _of_environment(
     kind: str, spec: PictureSpec, tasks: Sequence[str], own: Mapping[str, Any], world: Mapping[str, Any]
-) -> Figure:
+) -> Composed:
     """Draw a picture that an environment brings, of one or several tasks."""
     if not tasks:
         raise OptionError(f"picture '{kind}' shows the environment of a task: add --task TASK")
@@ -209,4 +209,4 @@ def _of_environment(
             f"picture '{kind}' of environment '{loaded[0].environment.name}' returned {type(figure).__name__}, "
             "not a matplotlib.figure.Figure"
         )
-    return figure
+    return Composed(figure, tasks=tuple(task.name for task in loaded))

@@ -14,7 +14,7 @@ from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import catalog, identity
-from qrlsuite.experiment.task import is_quick, name_in
+from qrlsuite.experiment.task import is_quick, is_task_file
 from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.leaderboard.pictures import compose
 from qrlsuite.leaderboard.shelf import collect, published_studies
@@ -118,7 +118,7 @@ def describe(
 def is_study(name: str) -> bool:
     """Return whether a name can only be a study's: that of its file, or of a published one or its folder."""
     if name.endswith(".toml"):
-        return name_in(Path(name)) is None
+        return not is_task_file(Path(name))
     return published_studies.folder_of(name) is not None
 
 

@@ -167,7 +167,7 @@ PluginOption = Annotated[
     typer.Option(
         "--plugin",
         metavar="PATH",
-        help="Use a plugin that lies there: a Python file, a package's folder, or an entry's folder. Repeatable.",
+        help="Use a plugin that lies there: a file, or the folder of a package, a project or an entry. Repeatable.",
         expose_value=False,
     ),
 ]

@@ -30,7 +30,8 @@ def entries_here(context: typer.Context, incomplete: str) -> list[str]:
     folders = [Path(context.params.get("runs") or os.environ.get("QRLSUITE_RUNS") or "runs")]
     folders += [PUBLISHED] if any(option.name == "published" for option in context.command.params) else []
     task = context.params.get("task")
-    among = task if isinstance(task, str) and re.fullmatch(r"[\w.+-]+", task) else None
+    plain = isinstance(task, str) and re.fullmatch(r"[\w.+-]+", task) and not task.endswith(".toml")
+    among = task if plain else None
     paths = [store.path for folder in folders if folder.is_dir() for store in entries(folder, among)]
     names = {f"{path.parent.name}/{path.name}" if "/" in incomplete else path.name for path in paths}
     return sorted(name for name in names if name.startswith(incomplete) and name.isprintable())

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColum
 from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import again, command, printable
 from qrlsuite.engine.work import Missing
+from qrlsuite.errors import listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import SeedGroup
@@ -450,10 +451,12 @@ class RunDisplay:
             return  # nothing was trained that a board or a picture could show
         name = self.entry.task.name
         stored = lookup.stored(entries(self.missing.runs, name))
-        if others := sum(each.key[1] not in ("", self.entry.task.hash) for each in stored):
+        others = [each.name for each in stored if each.key[1] not in ("", self.entry.task.hash)]
+        if others:
+            delete = command("runs", "rm", f"{name}/{others[0]}", runs=self.missing.runs)
             self.console.print(
-                f"another definition of task '{name}' has {counted(others, 'entry')} here: boards and "
-                "pictures show the definition with the most entries (qrlsuite runs rm ENTRY deletes one)",
+                f"{counted(len(others), 'entry')} of another definition of task '{name}' here: {listed(others, 3)}. "
+                f"Boards rank the definition with the most entries, pictures need a single one. To delete: {delete}",
                 markup=False,
                 soft_wrap=True,
             )

@@ -40,6 +40,7 @@ def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
 def task_file(name: str) -> str:
     """Return a task as the text of its file; of one that no file has, as one that may be saved and changed."""
     if not is_quick(name):
+        load(name)
         path = name if name.endswith(".toml") else registry.get(specs.TaskSpec, name).path
         return Path(path).read_text(encoding="utf-8")
     return tomli_w.dumps(load(name).file.model_dump(mode="json", exclude_unset=True))

@@ -549,19 +549,28 @@ def _registered(name: str) -> Path:
     try:
         return Path(registry.get(specs.TaskSpec, name).path)
     except UnknownNameError as error:
-        for path in sorted(Path().glob("*.toml")):
-            if name_in(path) == name:
-                raise UnknownNameError(
-                    f"task '{name}' is not registered, but a file has it: write {path}"
-                ) from None
-        raise UnknownNameError(f"{error}; of a task file, write the path: FILE.toml") from None
+        raise UnknownNameError(
+            in_a_file(name) or f"{error} (a task file needs its path: FILE.toml)"
+        ) from None
 
 
-def name_in(path: Path) -> str | None:
-    """Return the name of the task that a file defines; None if the file is no task file."""
+def in_a_file(name: str) -> str:
+    """Say which file of the current folder has a task that is not registered; nothing where none has."""
+    for path in sorted(Path().glob("*.toml")):
+        content = _task_in(path)
+        if content is not None and name in (content.get("name"), path.stem):
+            return f"task '{name}' is not registered, but in a file: write --task {path}"
+    return ""
+
+
+def is_task_file(path: Path) -> bool:
+    """Whether a file can be read and has the environment of a task."""
+    return _task_in(path) is not None
+
+
+def _task_in(path: Path) -> dict[str, Any] | None:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    name = content.get("name")
-    return name if "environment" in content and isinstance(name, str) else None
+    return content if "environment" in content else None

@@ -11,7 +11,7 @@ from typing import Protocol, TypeVar
 from qrlsuite import notation, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed, nearest
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.experiment.task import load
+from qrlsuite.experiment.task import in_a_file, load
 from qrlsuite.results.store import EntryStore
 
 
@@ -73,7 +73,7 @@ def task_name(runs: Path, task: str | None) -> str | None:
 
 
 def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> list[str]:
-    """Return the names of tasks: as they are written, or that of the task file whose path is written.
+    """Return the names of tasks: as they are written, or that of `gym:ID` or of the task file whose path is written.
 
     Parameters
     ----------
@@ -83,17 +83,26 @@ def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> l
     Raises
     ------
     UnknownNameError
-        With the nearest name, or what there is, if a task is neither registered nor has a folder of results.
+        If a name is neither registered nor has a folder of results: with the nearest one, or the file that has it.
     FileError
         If a task file cannot be read or is malformed.
     """
     folders = [folder for folder in (runs, *also) if folder.is_dir()]
     held = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
-    names = [load(name).name if name.endswith(".toml") else name for name in tasks]
-    for name in names:
+    names = []
+    for name in tasks:
         known = registry.load().of(specs.TaskSpec)
-        if name not in held and name not in known:
-            raise UnknownNameError(f"unknown task '{name}'{nearest(name, {*known, *held})}")
+        if name.startswith("gym:"):
+            from qrlsuite.gymlanes import quick_name  # Gymnasium is slow to import
+
+            names.append(quick_name(name.removeprefix("gym:")))
+        elif name.endswith(".toml"):
+            names.append(load(name).name)
+        elif name in held or name in known:
+            names.append(name)
+        else:
+            unknown = f"unknown task '{name}'{nearest(name, {*known, *held})}"
+            raise UnknownNameError(in_a_file(name) or unknown)
     return names
 
 

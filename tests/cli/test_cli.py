@@ -49,7 +49,7 @@ def test_a_run_says_where_entries_have_another_definition_of_its_task(task: str,
     )
     assert "another definition" not in qrlsuite(*words).stderr
     Path(task).write_text(TINY.replace("validation_episodes = ", "validation_episodes = 1"))
-    assert "another definition of task 'tiny' has 1 entry here" in qrlsuite(*words).stderr
+    assert "1 entry of another definition of task 'tiny' here: ddqn-mlp-" in qrlsuite(*words).stderr
 
 
 def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> None:
@@ -310,8 +310,11 @@ show ansatz iqp cx => ansatz iqp cx: give one name
 show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
 show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
 show ansatz iqp --qubits 4 => --qubits is gone: write it after the name
-run mlp --task tiny => task 'tiny' is not registered, but a file has it: write tiny.toml
+run mlp --task tiny => task 'tiny' is not registered, but in a file: write --task tiny.toml
+leaderboard --task tiny => in a file: write --task tiny.toml
 run mlp --task gone => unknown task 'gone'
+show task gone.toml --format toml => task file gone.toml cannot be read
+leaderboard --task tiny.toml => there is no results folder runs
 show bar.toml => pictures.0.kind: unknown picture 'bar'; did you mean 'bars'
 show many.toml => many.toml: pictures.0.settings
 show episodes.toml => pictures.0.evaluation: picture 'histogram' needs evaluation

@@ -16,6 +16,7 @@ from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.specs import EnvironmentSpec, PictureSpec
 from tests.commands import say
+from tests.conftest import TINY
 from tests.leaderboard.test_pictures import learner, noisy
 
 
@@ -74,6 +75,15 @@ def test_pictures_of_an_environment(tmp_path: Path) -> None:
         out = tmp_path / f"{kind}.png"
         call("plot", kind, "--task", "beam6g", setting, "--out", str(out))
         assert out.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_picture_of_a_task_file_is_named_after_the_task(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.toml").write_text(TINY)
+    call("plot", "field", "--task", str(tmp_path / "own.toml"))
+    assert (tmp_path / "tiny-field.png").exists()
 
 
 def test_a_third_partys_environment_may_draw_and_is_checked(

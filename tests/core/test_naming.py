@@ -98,6 +98,12 @@ def test_a_task_is_known_by_registration_or_by_its_results(tmp_path: Path) -> No
     (tmp_path / "mine").mkdir()
     assert lookup.task_names(tmp_path, ["mine", "beam6g"]) == ["mine", "beam6g"]
     assert lookup.task_names(tmp_path / "nowhere", ["beam6g"]) == ["beam6g"]
+    assert lookup.task_name(tmp_path, None) is None
+    (tmp_path / "own.toml").write_text(TINY)
+    assert lookup.task_names(tmp_path, [str(tmp_path / "own.toml"), "gym:CartPole-v1"]) == [
+        "tiny",
+        "gym-cartpole-v1",
+    ]
     with pytest.raises(UnknownNameError, match="unknown task 'mime'; did you mean 'mine'"):
         lookup.task_names(tmp_path, ["mine", "mime"])
 

@@ -13,7 +13,7 @@ from qrlsuite.cli.arguments import PublishedOption, RunsOption, TaskOption
 from qrlsuite.engine.status import survey
 from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.report.live import Live, Server, serve
-from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.leaderboard.shelf import collect, published_studies
 
 
 def view(
@@ -33,7 +33,7 @@ def view(
 
     Example: qrlsuite view
     """
-    tasks = [task] if task else []
+    tasks = collect.task_names(runs, [task] if task else [], published)
 
     def render() -> str:
         board = api.board(tasks, runs=runs, published=published)
@@ -43,7 +43,9 @@ def view(
 
     with Server(port) as server:
         typer.echo(f"reading {runs} ...")
-        live = Live(render, lambda: survey(runs, task) if runs.is_dir() or not published else [])
+        live = Live(
+            render, lambda: survey(runs, next(iter(tasks), None)) if runs.is_dir() or not published else []
+        )
         typer.echo(f"{runs} is shown to browsers on this machine, until Ctrl-C, at {server.address}")
         serve(server, live)
     typer.echo("\nended; nothing in the folder was changed")
