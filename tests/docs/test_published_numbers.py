@@ -12,6 +12,7 @@ from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import LearningCurves, Verdict, compare
+from tests.docs import load
 from tests.statistics.conftest import SURFACE
 
 ROOT = Path(__file__).parents[2]
@@ -125,3 +126,32 @@ def test_what_the_board_of_three_spins_says() -> None:
         (record,) = (each for each in records if each["label"] == called(circuit))
         assert record["identity"]["algorithm_options"]["quantum_lr"] < 1e-4
         assert record["identity"]["algorithm_options"]["lr"] <= 0.03
+
+
+def test_what_the_board_of_clifford_says() -> None:
+    text = " ".join(PAGE.partition("\n## Clifford operations\n")[2].partition("\n## ")[0].split())
+    records = [json.loads(path.read_text()) for path in sorted((PUBLISHED / "clifford").glob("*/entry.json"))]
+    tunings = {record["label"]: record["tuning"] for record in records}
+    reached = {label for label, tuning in tunings.items() if tuning["budget"] == "expected regret 3%"}
+    assert {label.split()[1] for label in reached} == {"mlp", "vqc-native"}
+    assert len(reached) == 3
+    regrets = {
+        name: (round(100 * tuning["regret"]["expected"]), tuning["runs"])
+        for label, tuning in tunings.items()
+        for name in ("width=16", "separable", "mean-field", "width=64", "tanh")
+        if name in label
+    }
+    assert (
+        f"width 16 at {regrets['width=16'][0]} percent ({regrets['width=16'][1]} runs), separable at "
+        f"{regrets['separable'][0]}, mean-field at {regrets['mean-field'][0]}, width 64 at {regrets['width=64'][0]}, "
+        f"and tanh at {regrets['tanh'][0]}, after {regrets['tanh'][1]} runs alone."
+    ) in text
+    [section] = api.board("clifford", published=True, runs="none").sections
+    spent = sum(float(row["core_hours"]) for row in section.as_dict()["rows"])
+    hours = sum(tuning["core_hours"] for tuning in tunings.values())
+    assert f"The searches took {hours:.2f} core-hours, the 400 runs {spent:.2f}." in text
+    pairs = {row[1]: row[2] for row in load("tables").pairs("clifford")}
+    for asked, share in (("tanh", "37% more"), ("sines", "30% more"), ("width 6", "4% fewer")):
+        assert share in pairs[f"`iqp` against {asked}"]
+    assert "It needs 37% and 30% more steps." in text
+    assert "behind the circuit, by 4 percent." in text

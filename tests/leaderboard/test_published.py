@@ -714,7 +714,7 @@ def test_an_ambiguous_name_lists_entries_of_boards_where_some_fit(tmp_path: Path
         api.load("mlp width=64", runs=tmp_path, published=True)
     assert "beam6g-a5-0" not in str(raised.value)
     with pytest.raises(QrlSuiteError, match="'ppo mlp' may be any of 'ppo mlp width=16'"):
-        api.load("ppo mlp", runs=tmp_path, published=True)
+        api.load("ppo mlp", task="beam6g", runs=tmp_path, published=True)
 
 
 def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:
