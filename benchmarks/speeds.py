@@ -65,6 +65,15 @@ SMALL_CIRCUITS = [
         ("vqc-native", {"model.qubits": 4, "layers": 4}),
     )
 ]
+SMALL_CIRCUITS += [
+    (task, "ppo", model, {**options, "repeats": 20}, 50)
+    for task in ("vqe-ising", "clifford")
+    for model, options in (
+        ("mlp", {"width": 6, "depth": 2}),
+        ("mlp", {"width": 64, "depth": 2}),
+        ("vqc-native", {"model.qubits": 4, "layers": 4}),
+    )
+]
 ENTRIES = WIDTHS + DEPTHS + CIRCUITS + DEEPER + ON_POLICY + CARTPOLE + SMALL_CIRCUITS
 
 Row = dict[str, Any]
