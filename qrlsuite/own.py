@@ -300,7 +300,7 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
     for path in paths:
         if not beside_results:
             load(os.path.relpath(folder / path) if folder is not None else path)
-        elif not {Path(path).name, _package_of(folder, path)} & _own().loaded.keys():
+        elif _package_of(folder, path) not in _own().loaded:
             raise FileError(
                 f"{source}: plugins: what lies beside results is not imported on the word of a file there; if you "
                 f"trust it, add --plugin {os.path.join(folder or '', path)}"

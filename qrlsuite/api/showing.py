@@ -81,8 +81,8 @@ def describe(
         among = [specs.StudySpec]
     known = registry.load()
     found = [each for each in among if name in known.of(each)]
-    of_file = name.startswith("gym:") or name.endswith(".toml")
-    if (among == [specs.TaskSpec] and is_quick(name)) or (of_file and specs.TaskSpec in among):
+    unregistered = name.startswith("gym:") or name.endswith(".toml")
+    if (among == [specs.TaskSpec] and is_quick(name)) or (unregistered and specs.TaskSpec in among):
         found = [specs.TaskSpec]
     if specs.StudySpec in (*found[:1], *among[:1]) and len(found) < 2:
         from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it

@@ -125,7 +125,18 @@ def test_what_the_board_of_three_spins_says() -> None:
     for circuit in ("vqc-native model.qubits=4 init", "vqc-native model.qubits=4 layers=5 ansatz=jerbi init"):
         (record,) = (each for each in records if each["label"] == called(circuit))
         assert record["identity"]["algorithm_options"]["quantum_lr"] < 1e-4
-        assert record["identity"]["algorithm_options"]["lr"] <= 0.03
+        assert round(record["identity"]["algorithm_options"]["lr"], 2) == 0.03
+
+    times, labels = section.as_dict()["times"], {row["entry"]: row["label"] for row in rows}
+    ranked = [labels[row["entry"]] for row in times["entries"]]
+    controls = {
+        kind: [place for place, label in enumerate(ranked) if kind in label]
+        for kind in ("separable", "mean-field")
+    }
+    for ahead in controls["separable"]:
+        for behind in (*controls["mean-field"], ranked.index(width)):
+            assert ahead < behind
+            assert times["adjusted_p"][ahead][behind] <= 0.05
 
 
 def test_what_the_board_of_clifford_says() -> None:
