@@ -11,6 +11,7 @@ A comment names the task or study and the kind of the table that follows it:
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -146,6 +147,10 @@ PAIRS: dict[str, tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = {
         ("pulse", ("iqp", "jerbi"), ("width 8", "sines")),
         ("vqe-ising", ("iqp", "jerbi"), ("width 5", "sines")),
         ("clifford", ("iqp",), ("width 6", "tanh", "sines")),
+        ("cartpole", ("iqp",), ("width 8", "tanh", "sines")),
+        ("acrobot", ("iqp",), ("width 8", "tanh", "sines")),
+        ("frozenlake", ("iqp",), ("width 6", "tanh", "sines")),
+        ("channel", ("iqp",), ("width 6", "tanh", "sines")),
     )
 }
 """The pairs of boards of small circuits that answer a question, by short names of the entries."""
@@ -167,7 +172,8 @@ def pairs(task: str) -> Rows:
     [section] = api.board(task, published=True, runs="none").sections
     facts = section.as_dict()
     order = [row["entry"] for row in facts["times"]["entries"]]
-    rows = {_short(row["label"]): row for row in facts["rows"]}
+    [(algorithm, _)] = Counter(row["label"].split()[0] for row in facts["rows"]).most_common(1)
+    rows = {_short(row["label"]): row for row in facts["rows"] if row["label"].split()[0] == algorithm}
     for question, asked in PAIRS[task]:
         for place, (first, second) in enumerate(asked):
             one, two = rows[first], rows[second]
