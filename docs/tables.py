@@ -148,8 +148,6 @@ PAIRS: dict[str, tuple[tuple[str, tuple[tuple[str, str], ...]], ...]] = {
         ("vqe-ising", ("iqp", "jerbi"), ("width 5", "sines")),
         ("clifford", ("iqp",), ("width 6", "tanh", "sines")),
         ("cartpole", ("iqp",), ("width 8", "tanh", "sines")),
-        ("acrobot", ("iqp",), ("width 8", "tanh", "sines")),
-        ("frozenlake", ("iqp",), ("width 6", "tanh", "sines")),
         ("channel", ("iqp",), ("width 6", "tanh", "sines")),
     )
 }
