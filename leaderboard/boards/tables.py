@@ -91,7 +91,7 @@ def sheet(section: Section, explain: bool = False) -> Sheet:
     notes = _tier_notes(section) if section.by_tiers else _rank_notes(section)
     promise = [f"rule '{section.rule}': {section.promise}"] * section.by_tiers
     entries = [row.entry for row in section.rows]
-    warnings = [*unlike_others(entries), *_diverged(section), *changed_thresholds(entries)]
+    warnings = [*unlike_others(entries), *_never(section), *_diverged(section), *changed_thresholds(entries)]
     remarks = (notes[0], *warnings, *notes[1:], *_marks(section), *promise, *facts(section))
     return Sheet(title(section), tuple(columns), remarks, explain, label=f"{section.task}-{section.horizon}")
 
@@ -300,6 +300,17 @@ def _diverged(section: Section) -> list[str]:
         f"diverged (numbers of the agents are no longer finite), ranked with the scores that they had: {told}"
     )
     return [line] * bool(found)
+
+
+def _never(section: Section) -> list[str]:
+    """Say which entries stay below every threshold, and what ranks them nevertheless."""
+    found = [row for row in section.times.rows if row.at_cap == 1]
+    told = ", ".join(name for name in names([row.entry for row in found]))
+    line = (
+        f"no seed reached a threshold, so steps do not tell them apart: {told}. --by area ranks by the learning "
+        "curves alone"
+    )
+    return [line] * (len(found) > 1)
 
 
 def _of_seeds(entry: EntryResults) -> str:

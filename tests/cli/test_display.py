@@ -200,4 +200,5 @@ def test_the_end_says_that_no_threshold_was_reached(
         f"{summary['best_score']:.4g}."
     )
     assert (line in end) is said
+    assert ("(leaderboard --by area)" in end) is said
     assert ("([ranking] in the task file)" in end) is said

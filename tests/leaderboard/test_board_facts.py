@@ -55,6 +55,16 @@ def mostly_at_the_cap() -> board.Leaderboard:
     return boards.of([flat("best one", 0.1, 0.62), flat("poor one", 0.1), flat("poor two", 0.2)])
 
 
+def test_entries_that_reached_no_threshold_are_named_with_what_ranks_them(
+    mostly_at_the_cap: board.Leaderboard,
+) -> None:
+    line = (
+        "no seed reached a threshold, so steps do not tell them apart: poor one, poor two. --by area ranks by"
+    )
+    assert line in markdown(mostly_at_the_cap)
+    assert "no seed reached" not in markdown(boards.of([flat("best one", 0.1, 0.62), flat("poor one", 0.1)]))
+
+
 def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
     mostly_at_the_cap: board.Leaderboard,
 ) -> None:
