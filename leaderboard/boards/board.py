@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -100,11 +100,12 @@ def build(
     shown: Callable[[EntryResults], bool] | None = None,
     by: str = "steps",
     together: Sequence[str] = (),
+    definitions: Mapping[str, str] | None = None,
 ) -> Leaderboard:
     """Rank entries, task by task, or over several tasks.
 
-    Entries of one task that were made under another definition of it are refused: the majority's stands. So are those
-    of a study with looks, whose number of seeds depends on what they showed.
+    Entries of one task that were made under another definition of it are refused: the majority's stands, unless
+    `definitions` says which. So are those of a study with looks, whose number of seeds depends on what they showed.
 
     Parameters
     ----------
@@ -126,6 +127,8 @@ def build(
         One of `axes_of`: of `AXES`, or what the task's `[ranking] costs` names.
     together:
         Tasks over which the means of entries are compared, in one section.
+    definitions:
+        See `qrlsuite.leaderboard.boards.ranked.of_one_definition`; not for several tasks together.
 
     Raises
     ------
@@ -143,7 +146,7 @@ def build(
     if together:
         section = across.section(entries, together, horizon, alpha, refused, by)
         return Leaderboard((section,), section.shares.refused, by)
-    ranked, unranked = of_one_definition(entries)
+    ranked, unranked = of_one_definition(entries, definitions)
     made, problems = list[Any](), [*refused, *unranked]
     for task in sorted({entry.task for entry in ranked}):
         members = [entry for entry in ranked if entry.task == task]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,11 +52,18 @@ WITH_LOOKS = (
 )
 
 
-def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
+def of_one_definition(
+    entries: Sequence[EntryResults], definitions: Mapping[str, str] | None = None
+) -> tuple[list[EntryResults], list[str]]:
     """Leave out entries of studies with looks or chosen seeds, and those of another task or world than most.
 
     Another task is another definition of it; another world is other code of its environment, where a plugin makes it.
     Of two that equally many have, the one whose hash comes first stays.
+
+    Parameters
+    ----------
+    definitions:
+        Hashes by the names of tasks whose definition is known: that stays, however few have it.
 
     Returns
     -------
@@ -70,7 +77,7 @@ def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResult
     for task in sorted({entry.task for entry in fixed}):
         members = [entry for entry in fixed if entry.task == task]
         hashes = [entry.task_hash for entry in members]
-        definition = max(sorted(set(hashes)), key=hashes.count)
+        definition = (definitions or {}).get(task) or max(sorted(set(hashes)), key=hashes.count)
         kept += [entry for entry in members if entry.task_hash == definition]
         problems += [
             f"{entry.folder}: made under another definition of task '{task}' ({entry.task_hash}, not {definition})"

@@ -22,6 +22,7 @@ from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results import lookup
 from qrlsuite.results.store import write_atomically
 
 if TYPE_CHECKING:
@@ -171,6 +172,7 @@ def board(
         alpha,
         lambda entry: (entry.task_hash, entry.name) in keys,
         by,
+        definitions=lookup.definitions(several(task)),
     )
 
 

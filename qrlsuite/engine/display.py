@@ -456,7 +456,8 @@ class RunDisplay:
             delete = command("runs", "rm", f"{name}/{others[0]}", runs=self.missing.runs)
             self.console.print(
                 f"{counted(len(others), 'entry')} of another definition of task '{name}' here: {listed(others, 3)}. "
-                f"Boards rank the definition with the most entries, pictures need a single one. To delete: {delete}",
+                "Boards rank the definition with the most entries (--task FILE.toml: that of the file), pictures need "
+                f"a single one. To delete: {delete}",
                 markup=False,
                 soft_wrap=True,
             )

@@ -106,6 +106,12 @@ def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> l
     return names
 
 
+def definitions(tasks: Iterable[str]) -> dict[str, str]:
+    """Return the hashes of the tasks whose file's path is written, by name."""
+    written = [load(name) for name in tasks if name.endswith(".toml")]
+    return {task.name: task.hash for task in written}
+
+
 def choose(among: Sequence[N], name: str, searched: object) -> N:
     """Return the one entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
 

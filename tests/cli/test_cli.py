@@ -51,6 +51,15 @@ def test_a_run_says_where_entries_have_another_definition_of_its_task(task: str,
     Path(task).write_text(TINY.replace("validation_episodes = ", "validation_episodes = 1"))
     assert "1 entry of another definition of task 'tiny' here: ddqn-mlp-" in qrlsuite(*words).stderr
 
+    # the file's path asks for what it defines now, however many entries have another definition
+    Path(task).write_text(TINY)
+    qrlsuite(*words, "--set", "width=8")
+    for text, ranked in ((TINY, 2), (TINY.replace("validation_episodes = ", "validation_episodes = 1"), 1)):
+        Path(task).write_text(text)
+        board = json.loads(qrlsuite("leaderboard", "--format", "json", "--task", task, *words[-2:]).stdout)
+        assert {len(section["rows"]) for section in board["sections"]} == {ranked}
+        assert len(board["refused"]) == 3 - ranked
+
 
 def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
