@@ -128,6 +128,8 @@ class Section:
     """What is ranked."""
     costs: tuple[str, ...] = ()
     """What is shown beside it."""
+    policies: Mapping[str, float] = field(default_factory=dict)
+    """Final scores of policies to compare with, by name, as the task's `[ranking.policies]` says."""
 
     @property
     def before(self) -> str:
@@ -148,6 +150,7 @@ class Section:
             "provisional": self.provisional,
             "cell": self.cell,
             "rule": self.rule,
+            **({"policies": dict(self.policies)} if self.policies else {}),
             "times": self.times.as_dict(),
             "rows": [_row_dict(row) for row in self.rows],
         }
@@ -298,6 +301,7 @@ def _section(
         promise=rule.promise,
         score=entries[0].task_file.score,
         costs=tuple(ranking.costs),
+        policies=ranking.policies,
     )
 
 

@@ -263,17 +263,24 @@ def _rank_notes(section: Section) -> list[str]:
     )
     lines = [
         f"rank: by significant outperformance: {pairs}",
-        f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.cell}",
+        f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.cell}"
+        + policies_text(section),
     ]
     if any(row.ranks is None for row in times.rows):
         lines.append(TOO_FEW)
     return lines
 
 
+def policies_text(section: Section) -> str:
+    """Say what other policies score, as the end of a note: `; final score of random 0.51, greedy 0.72`."""
+    told = ", ".join(f"{name} {value:.4g}" for name, value in section.policies.items())
+    return f"; final {section.score.called} of {told}" * bool(told)
+
+
 def _tier_notes(section: Section) -> list[str]:
     return [
         "tier: 1 + the longest chain of entries above, each outperforming the next; sample complexity at "
-        f"{section.cell}",
+        f"{section.cell}{policies_text(section)}",
         *sorted({row.reason for row in section.rows if row.reason}),
     ]
 

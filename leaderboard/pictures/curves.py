@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -68,6 +70,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     axes.set_xlim(left=0)
     if relative:
         axes.set_ylim(0, 1)
+    _policies(axes, entries[0].task_file.ranking.policies)
     style.tidy(axes)
     title = f"{entries[0].task}: median of the runs{'' if many else ', 5th to 95th percentile'}"
     axes.set_title(title, fontsize="medium", loc="left")
@@ -79,3 +82,14 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     else:
         figure.legend(handles=handles, loc="outside lower left", fontsize=8, alignment="left", **legend)
     return figure
+
+
+def _policies(axes: Axes, scores: Mapping[str, float]) -> None:
+    """Draw a line at what other policies score, with its name beside the curves."""
+    for score in scores.values():
+        axes.axhline(score, color="#808080", linewidth=0.8, linestyle=":", zorder=1)
+    low, high = axes.get_ylim()
+    above = math.inf
+    for name, score in sorted(scores.items(), key=lambda each: -each[1]):
+        place = above = min((score - low) / (high - low), above - 0.04)  # names do not lie on each other
+        axes.text(1.01, place, name, color="#606060", fontsize=8, va="center", transform=axes.transAxes)

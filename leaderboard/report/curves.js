@@ -81,7 +81,8 @@
     });
     shown.forEach(({ band }) => (banded ? band : [band[1]]).forEach(see));
     runs.flat().forEach(see);
-    const pad = 0.04 * (high - low || 1);
+    see(section.policies.map(([, score]) => score));
+    const pad = (section.policies.length ? 0.07 : 0.04) * (high - low || 1); // room for a name above its line
     [low, high] = [low - pad, high + pad];
 
     const x = (steps) => LEFT + ((width - LEFT - RIGHT) * steps) / section.horizon;
@@ -111,6 +112,13 @@
     picture.append(
       text(width < 600 ? `score, by environment steps` : `${section.score}, by environment steps`, x(section.horizon / 2), height - 4, { "text-anchor": "middle" }),
       svg("line", { class: "level", x1: LEFT, x2: width - RIGHT, y1: at(section.level), y2: at(section.level), stroke: color("muted"), "stroke-dasharray": "5 4" }));
+    let above = -Infinity; // names of policies do not lie on each other
+    [...section.policies].sort((one, other) => other[1] - one[1]).forEach(([name, score]) => {
+      above = Math.max(y(score) - 4, above + 12);
+      picture.append(
+        svg("line", { class: "policy", x1: LEFT, x2: width - RIGHT, y1: at(score), y2: at(score), stroke: color("muted"), "stroke-dasharray": "1 4" }),
+        text(name, width - RIGHT, above, { "text-anchor": "end", "font-size": 11 }));
+    });
     shown.forEach(({ entry, look: [tone], band: [least, , most] }, k) => {
       if (banded) {
         const back = most.map((score, epoch) => (score === null ? "" : `L${point(score, epoch, entry.steps)}`)).reverse().join("");

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 import qrlsuite
 from qrlsuite.leaderboard.boards.board import Leaderboard
-from qrlsuite.leaderboard.boards.tables import cost_text
+from qrlsuite.leaderboard.boards.tables import cost_text, main_section, policies_text
 from qrlsuite.leaderboard.report import entries, sections, winners
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
@@ -58,6 +58,9 @@ def render(
     shown = entries.views(list(curves.values()))
     by_curves = {id(entry.curves): entry for entry in shown}
     boards = [sections.view(section, number, by_curves) for number, section in enumerate(board.sections)]
+    tasks = dict.fromkeys(section.task for section in board.sections)
+    each_task = [[section for section in board.sections if section.task == task] for task in tasks]
+    main = [boards[board.sections.index(main_section(each))] for each in each_task]
     scripts = [_file(name) for name in (*SCRIPTS, *[LIVE] * live)]
     data = {"entries": entries.curves_data(shown), "sections": [view.data for view in boards]}
     now = datetime.datetime.now(datetime.UTC)
@@ -68,13 +71,14 @@ def render(
             title=clean(title),
             version=qrlsuite.__version__,
             date=f"{now.day} {now:%B %Y}",
-            outcome=winners.outcome(view.winners for view in boards),
+            outcome=winners.outcome(view.winners for view in main),
+            main=main,
             extent=sections.extent(boards, shown),
             sections=boards,
             entries=shown,
             studies=[looks_report.view(study) for study in studies],
             beside=[] if beside is None else beside.sheets(explain=True),
-            tasks=len({section.task for section in board.sections}),
+            tasks=len(tasks),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,
             too_few=TOO_FEW,
@@ -89,6 +93,7 @@ def render(
             clean=clean,
             counted=counted,
             cost_text=cost_text,
+            policies_text=policies_text,
         )
     )
 

@@ -239,6 +239,7 @@ def _data(
         "entries": [row.entry.index for row in rows],
         "names": [row.name for row in rows],
         "level": level,
+        "policies": [[clean(name), value] for name, value in section.policies.items()],
         "score": f"{'' if external else 'validation '}{clean(section.score.called)}"
         f"{' (received / optimal)' * section.score.of_optimum}",
         "levelName": symbol(judgement.grid),

@@ -19,6 +19,7 @@ from qrlsuite import registry, specs
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.task import Task, load
 from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.leaderboard.shelf import collect
@@ -159,7 +160,8 @@ def evaluate(
     runs:
         The results folder.
     names:
-        The entries, of one task, as `qrlsuite.leaderboard.shelf.collect.find` finds them.
+        The entries, of one task, as `qrlsuite.leaderboard.shelf.collect.find` finds them; none are the reference
+        policies of `task` alone.
     task:
         The task that is played, by name or file. Entries are looked for among its own; one that is named with another
         task before it (`TASK/ENTRY`), or by its folder, plays it too, where observations and actions are the same.
@@ -187,8 +189,10 @@ def evaluate(
     StoreError
         If an entry has no trained agent.
     """
-    if not names:
-        raise OptionError("name at least one entry to evaluate")
+    if not names and (task is None or backend or perturb):
+        raise OptionError(
+            "name at least one entry to evaluate, or --task alone for a task's reference policies"
+        )
     on = None if task is None else the_task(runs, task, published)
     found = (find(runs, name, None if on is None else on.name, published) for name in names)
     stores = list({store.path.resolve(): store for store in found}.values())
@@ -215,7 +219,7 @@ def evaluate(
         played = [evaluation.trained(store, *more) for store in stores]
         elsewhere = [each.play(episodes, seed, report) for each in deployed]
         elsewhere += [evaluation.trained(store, *more, scale) for store in stores for scale in perturb]
-        entry = evaluation.trained_entry(stores[0], on)
+        entry = evaluation.trained_entry(stores[0], on) if stores else resolve(task or "", "mlp")
         references = evaluation.references(entry, episodes, seed, report)
     finally:
         bar.stop()

@@ -166,12 +166,22 @@ class RankingSection(options.Table):
         list[Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64)]],
         Field(description="what of info['metrics'] boards show beside the score, less is better: violations"),
     ] = []
+    policies: Annotated[
+        dict[
+            Annotated[str, Field(pattern=r"^\w[\w .,()/-]*$", max_length=40)],
+            Annotated[float, Field(allow_inf_nan=False)],
+        ],
+        Field(
+            max_length=8, description="final scores of policies to compare with: random, the best one known"
+        ),
+    ] = {}
     _score: ScoreSection = PrivateAttr(ScoreSection())
 
     @model_serializer(mode="wrap")
     def _without_absent(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out an absent rule, and costs if there are none: earlier versions can read the files."""
-        return {name: value for name, value in write(self).items() if name not in ("rule", "costs") or value}
+        """Leave out an absent rule, costs and policies if there are none: earlier versions can read the files."""
+        late = ("rule", "costs", "policies")
+        return {name: value for name, value in write(self).items() if name not in late or value}
 
     @model_validator(mode="after")
     def _consistent(self) -> RankingSection:
@@ -371,9 +381,12 @@ class Task:
         location = f"environment '{self.environment.name}'"  # not the file: its own options are in order
         options.build(specs.resolve(self.environment.options), merged, location)
         section = self.file.environment.model_copy(update={"options": merged})
-        changed = Task(self.file.model_copy(update={"environment": section}), self.source)
+        file = self.file.model_copy(update={"environment": section})
+        changed = Task(file, self.source)
         if changed.hash != self.hash:
             changed.name = f"{self.name}+{changed.hash[:8]}"
+            ranking = file.ranking.model_copy(update={"policies": {}})  # they have other scores in it
+            changed.file = file.model_copy(update={"ranking": ranking})
         return changed
 
     def preset(self, name: str | None, algorithm: str, family: str) -> tuple[str | None, dict[str, Any]]:
@@ -453,7 +466,7 @@ def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | N
 
     Where it has `extends = TASK`, the content is that task's, with this file's values in place of its own. Tables are
     merged key by key. Every other value, a list too, replaces the one of the extended task; thresholds replace its
-    epsilons.
+    epsilons. Scores of its policies go where the environment or the score is another.
 
     Parameters
     ----------
@@ -475,6 +488,8 @@ def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | N
         raise FileError(f"{source}: extends: {error}") from None
     base = _whole(files.read(path, "task file"), path.name, (*below, name), path.parent)
     ranking, changed = base.get("ranking"), data.get("ranking")
+    if isinstance(ranking, dict) and not data.keys().isdisjoint({"environment", "score"}):
+        ranking.pop("policies", None)
     if isinstance(ranking, dict) and isinstance(changed, dict) and "thresholds" in changed:
         for table in (ranking, ranking.get("reference")):  # they take the place of tolerances
             if isinstance(table, dict):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from tests.commands import qrlsuite, say
 from tests.conftest import Train
 
@@ -33,6 +33,16 @@ def test_table_json_and_picture(train: Train, tmp_path: Path) -> None:
     assert len(by_name["ddqn mlp width=16"]["seeds"]) == 2
     assert by_name["random"]["episodes"] == 30
     assert say(*words, "--json").stdout == printed
+
+
+def test_a_tasks_reference_policies_play_without_entries(tmp_path: Path) -> None:
+    words = ["evaluate", "--task", "beam6g", "--episodes", "20", "--runs", str(tmp_path)]
+    played = json.loads(say(*words, "--json").stdout)["policies"]
+    assert [each["policy"] for each in played] == ["optimal", "nearest antenna", "random"]
+    assert played[0]["score"]["mean"] == 1.0
+    for more in (["--backend", "native shots=10"], ["--perturb", ".1"]):
+        with pytest.raises(OptionError, match="name at least one entry to evaluate, or --task alone"):
+            say(*words, *more)
 
 
 def test_what_cannot_be_played_is_refused(train: Train, tmp_path: Path) -> None:

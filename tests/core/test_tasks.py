@@ -38,6 +38,8 @@ name = "tiny" => name = "tiny task" => name = 'tiny task'
 degree = 3 => degre = 3 => no option 'degre'; did you mean 'degree'
 degree = 3 => degree = [{5000}]{5000} => not valid TOML: too large a value: maximum recursion
 deltas = [0.5, 0.75] => deltas = [0.5, 1.5] => ranking.deltas.1 = 1.5
+deltas = [0.5, 0.75] => deltas = [0.5]\npolicies = {random = nan} => ranking.policies.random = nan
+deltas = [0.5, 0.75] => deltas = [0.5]\npolicies = {"<b>" = 0.1} => ranking.policies
 deltas = [0.5, 0.75] => deltas = [0.5, 0.5] => deltas: 0.5 is there twice
 epsilons = [0.6, 0.8] =>  => give either epsilons
 epsilons = [0.6, 0.8] => epsilons = [0.6, 0.8, 0.60] => epsilons: 0.6 is there twice, and its cells would
@@ -172,6 +174,19 @@ def test_other_environment_options_make_another_task(tmp_path: Path) -> None:
     assert other.hash != base.hash
     assert other.name == f"tiny+{other.hash[:8]}"
     assert base.with_environment({"degree": 3}).name == "tiny"
+
+
+def test_scores_of_policies_are_no_part_of_a_task_and_hold_in_its_own_environment_alone() -> None:
+    stated = TINY.replace("[ranking]\n", "[ranking]\npolicies = { random = 0.4 }\n")
+    base = task.parse(stated, "t")
+    assert base.hash == task.parse(TINY, "t").hash
+    assert base.file.ranking.policies == base.with_environment({"degree": 3}).file.ranking.policies != {}
+    assert base.with_environment({"degree": 4}).file.ranking.policies == {}
+    assert "policies" not in task.parse(TINY, "t").file.ranking.model_dump()
+    head = 'format_version = 1\nextends = "pulse"\nname = "other"\nsummary = "Another"\n'
+    assert task.parse(head, "t").file.ranking.policies == task.load("pulse").file.ranking.policies != {}
+    longer = task.parse(f"{head}[environment.options]\nsteps = 30\n", "t")
+    assert longer.file.ranking.policies == {}
 
 
 def test_tasks_that_extend_beam6g_are_those_they_were_when_their_files_were_whole() -> None:

@@ -19,6 +19,7 @@ from matplotlib.patches import Rectangle
 
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.pictures import cells, few_runs, histogram
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -235,11 +236,23 @@ def test_histogram_says_means_and_numbers_of_episodes() -> None:
 
 
 def test_curves_show_single_runs_of_few() -> None:
+    others = 3  # lines at the scores of policies
     few = pictures.draw("curves", [learner(seeds=3)])
-    assert len(few.axes[0].get_lines()) == 4
+    assert len(few.axes[0].get_lines()) == 4 + others
     many = pictures.draw("curves", [learner(seeds=50)])
-    assert len(many.axes[0].get_lines()) == 1
+    assert len(many.axes[0].get_lines()) == 1 + others
     assert not [c for c in many.axes[0].collections if isinstance(c, PathCollection)]
+
+
+def test_curves_have_the_scores_of_policies_whose_names_do_not_lie_on_each_other() -> None:
+    [axes] = pictures.draw("curves", [learner(seeds=50)]).axes
+    stated = tasks.load("beam6g").file.ranking.policies
+    assert {line.get_ydata()[0] for line in axes.get_lines() if line.get_linestyle() == ":"} == set(
+        stated.values()
+    )
+    places = {text.get_text(): text.get_position()[1] for text in axes.texts}
+    assert places["random"] == pytest.approx(stated["random"])
+    assert places["optimal"] - places["nearest antenna"] >= 0.04 - 1e-9
 
 
 def test_a_curve_of_one_epoch_can_be_seen() -> None:

@@ -157,6 +157,22 @@ def test_numbers_in_words() -> None:
     assert words.ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
 
 
+def test_a_task_has_one_row_in_who_wins_where_and_its_policies_are_named() -> None:
+    whole = [
+        boards.entry(name, epochs=500, speed=speed, task="cartpole") for name, speed in (("a", 1), ("b", 2))
+    ]
+    page = render(boards.of([*whole, *boards.graded(2)]))
+    answers = page.partition('<table class="answers"')[2].partition("</table>")[0]
+    assert re.findall(r"#board-(\d)", answers) == [
+        "0",
+        "2",
+        "1",
+    ]  # beam6g; cartpole at its whole and its short horizon
+    assert ">100k steps</a>" in answers
+    assert "final score of random 0.37, nearest antenna 0.976, optimal 1." in page
+    assert '"policies":[["random",0.044]]' in page.replace(" ", "")
+
+
 def test_the_page_names_no_other_place_but_the_paper() -> None:
     text = render(boards.of(boards.graded(2)))
     without_scripts = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)

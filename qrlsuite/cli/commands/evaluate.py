@@ -17,13 +17,14 @@ from qrlsuite.results.store import write_atomically
 
 def evaluate(
     entries: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             metavar="ENTRY...",
-            help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder.",
+            help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder. None: the reference "
+            "policies of --task alone.",
             autocompletion=entries_here,
         ),
-    ],
+    ] = None,
     task: Annotated[
         str | None,
         typer.Option(
@@ -78,7 +79,8 @@ def evaluate(
     The best agents are chosen by their last validation score; these episodes are new, and the same for every
     policy, so the choice does not raise the result. Agents act as in validation. It shows sums of rewards and,
     where the task knows a maximum, relative scores. The random policy is always there; an environment may offer
-    others (beam6g: the optimal one and the nearest antenna).
+    others (beam6g: the optimal one and the nearest antenna). A task file may state their scores ([ranking.policies]):
+    boards and pictures show them.
 
     With --task OTHER, TASK/ENTRY plays another task than it was trained on, if observations and actions are the same.
 
@@ -87,12 +89,14 @@ def evaluate(
 
     Example: qrlsuite evaluate vqc-native --backend "qiskit estimator=aer shots=1000"
 
+    Example: qrlsuite evaluate --task pulse --episodes 10000
+
     Example: qrlsuite evaluate "mlp width=64" vqc-native --best 10 --episodes 1000 --out histogram.png
     """
     format_ = pictures.format_of(out)
     evaluations = evaluation.evaluate(
         runs,
-        entries,
+        entries or (),
         task=task,
         best=best,
         episodes=episodes,
