@@ -25,7 +25,7 @@ TASKS = ("beam6g", "cartpole")
 
 def runs_of(label: str, task: str, epochs_below: list[int], **identity: object) -> EntryResults:
     """Runs that score 0, and 1 from an epoch on."""
-    entry = boards.entry(label, len(epochs_below), 500 if task == "cartpole" else 100, task=task)
+    entry = boards.entry(label, len(epochs_below), task=task)
     curves = np.ones(entry.curves.shape)
     for run, epoch in enumerate(epochs_below):
         curves[run, :epoch] = 0
@@ -36,13 +36,13 @@ def both(label: str, share: float, seeds: int = 20) -> list[EntryResults]:
     """Below threshold for a share of the horizon of both tasks; every second run a twentieth longer."""
     return [
         runs_of(label, "beam6g", [round(100 * share) + 5 * (i % 2) for i in range(seeds)]),
-        runs_of(label, "cartpole", [round(500 * share) + 25 * (i % 2) for i in range(seeds)]),
+        runs_of(label, "cartpole", [round(100 * share) + 5 * (i % 2) for i in range(seeds)]),
     ]
 
 
 def test_shares_means_and_decided_pairs_by_hand() -> None:
     board = across.section([*both("slow", 0.6, 30), *both("quick", 0.2)], TASKS)
-    assert board.shares.horizons == (200_000, 500_000)
+    assert board.shares.horizons == (200_000, 100_000)
     assert [board.results.names[i] for i in board.order] == ["quick", "slow"]
     assert board.results.mean[list(board.order)] == pytest.approx([0.225, 0.625])
     assert board.results.interquartile_mean[list(board.order)] == pytest.approx([0.225, 0.625])
@@ -80,14 +80,14 @@ def test_a_configuration_is_algorithm_model_and_options() -> None:
 
 
 def test_what_is_left_out_says_why() -> None:
-    short = replace(runs_of("short", "cartpole", [1] * 20), curves=np.ones((20, 100)))
+    short = replace(runs_of("short", "cartpole", [1] * 20), curves=np.ones((20, 50)))
     entries = [*both("quick", 0.2), *both("few", 0.2, 19), runs_of("short", "beam6g", [1] * 20), short]
     board = across.section(entries, TASKS)
-    assert "cartpole: short: ends at 100000 of 500000 steps" in board.shares.refused
+    assert "cartpole: short: ends at 50000 of 100000 steps" in board.shares.refused
     assert "few: 19 seeds on beam6g, fewer than 20: undecided" in board.shares.refused
-    cut = across.section(entries, TASKS, horizon=100_000)
+    cut = across.section(entries, TASKS, horizon=50_000)
     assert set(cut.results.names) == {"quick", "short"}
-    assert cut.shares.horizons == (100_000, 100_000)
+    assert cut.shares.horizons == (50_000, 50_000)
     with pytest.raises(OptionError, match=r"alpha = 1.5 is outside \(0, 1\)"):
         across.section(entries, TASKS, alpha=1.5)
 
