@@ -228,6 +228,7 @@ def shares(
     refused: Sequence[str] = (),
     least: int = 2,
     by: str = "steps",
+    definitions: Mapping[str, str] | None = None,
 ) -> Shares:
     """Return the entries of one configuration that have a result on every task.
 
@@ -245,6 +246,8 @@ def shares(
         Seeds that an entry needs on every task.
     by:
         `steps`, or a key of `qrlsuite.leaderboard.boards.costs.UNITS`.
+    definitions:
+        See `qrlsuite.leaderboard.boards.ranked.of_one_definition`.
 
     Raises
     ------
@@ -255,7 +258,8 @@ def shares(
     reached: dict[str, dict[str, EntryResults]] = {}
     horizons = []
     for task in tasks:
-        end, of_task, left_out = _reaching(task, [each for each in entries if each.task == task], horizon)
+        members = [each for each in entries if each.task == task]
+        end, of_task, left_out = _reaching(task, members, horizon, definitions)
         horizons.append(end)
         lines += left_out
         for key, entry in of_task.items():
@@ -288,11 +292,11 @@ def shares(
 
 
 def _reaching(
-    task: str, members: Sequence[EntryResults], horizon: int | None
+    task: str, members: Sequence[EntryResults], horizon: int | None, definitions: Mapping[str, str] | None
 ) -> tuple[int, dict[str, EntryResults], list[str]]:
     """Return the horizon of a task, the entries that reach it by configuration, and lines about the others."""
     found = dict[str, EntryResults]()
-    ranked, lines = of_one_definition(members)
+    ranked, lines = of_one_definition(members, definitions)
     end = horizon or min(ranking_of(ranked or members).horizons)
     for entry in ranked:
         reached = entry.reaching(end // entry.steps_per_epoch)
@@ -350,6 +354,7 @@ def section(
     alpha: float = ALPHA,
     refused: Sequence[str] = (),
     by: str = "steps",
+    definitions: Mapping[str, str] | None = None,
 ) -> AcrossSection:
     """Compare all configurations that have 20 seeds or more on every task; arguments as for `shares`.
 
@@ -358,7 +363,7 @@ def section(
     alpha:
         In (0, 1): probability of any false decision; intervals have level 1 - alpha.
     """
-    configurations = shares(entries, tasks, horizon, refused, MIN_RUNS, by)
+    configurations = shares(entries, tasks, horizon, refused, MIN_RUNS, by, definitions)
     return AcrossSection(configurations, across_tasks(configurations.values, alpha), alpha, by)
 
 

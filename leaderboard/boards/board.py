@@ -128,7 +128,7 @@ def build(
     together:
         Tasks over which the means of entries are compared, in one section.
     definitions:
-        See `qrlsuite.leaderboard.boards.ranked.of_one_definition`; not for several tasks together.
+        See `qrlsuite.leaderboard.boards.ranked.of_one_definition`.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def build(
     if together and (by in scores.OF_RUNS or by not in AXES):
         raise OptionError(f"--by {by}: scores of several tasks have no common scale; name one task")
     if together:
-        section = across.section(entries, together, horizon, alpha, refused, by)
+        section = across.section(entries, together, horizon, alpha, refused, by, definitions)
         return Leaderboard((section,), section.shares.refused, by)
     ranked, unranked = of_one_definition(entries, definitions)
     made, problems = list[Any](), [*refused, *unranked]

@@ -99,9 +99,19 @@ def of_one_definition(
 
 
 def ranking_of(entries: Sequence[EntryResults]) -> RankingSection:
-    """Return the cells and horizons that most entries of a task have; they are equal where it is registered."""
+    """Return the cells and horizons that most entries of a task have; they are equal where it is registered.
+
+    The scores of policies are those that most of these entries state, whatever the others do.
+    """
     ranked = [entry.task_file.ranking for entry in entries]
-    return max(sorted(ranked, key=lambda r: r.model_dump_json()), key=ranked.count)
+    cells = [ranking.model_copy(update={"policies": {}}) for ranking in ranked]
+    most = max(sorted(cells, key=_json), key=cells.count)
+    stated = [ranking for ranking, own in zip(ranked, cells) if own == most and ranking.policies]
+    return max(sorted(stated, key=_json), key=stated.count, default=most)
+
+
+def _json(ranking: RankingSection) -> str:
+    return ranking.model_dump_json()
 
 
 def rule_of(entries: Sequence[EntryResults]) -> SignificanceRule:

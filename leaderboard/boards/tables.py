@@ -310,8 +310,8 @@ def _diverged(section: Section) -> list[str]:
 
 
 def _never(section: Section) -> list[str]:
-    """Say which entries stay below every threshold, and what ranks them nevertheless."""
-    found = [row for row in section.times.rows if row.at_cap == 1]
+    """Say which ranked entries stay below every threshold, and what tells them apart nevertheless."""
+    found = [row for row in section.times.rows if row.at_cap == 1 and row.ranks is not None]
     told = ", ".join(name for name in names([row.entry for row in found]))
     line = (
         f"no seed reached a threshold, so steps do not tell them apart: {told}. --by area ranks by the learning "

@@ -13,6 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
+from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
@@ -70,7 +71,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     axes.set_xlim(left=0)
     if relative:
         axes.set_ylim(0, 1)
-    _policies(axes, entries[0].task_file.ranking.policies)
+    _policies(axes, ranking_of(entries).policies)
     style.tidy(axes)
     title = f"{entries[0].task}: median of the runs{'' if many else ', 5th to 95th percentile'}"
     axes.set_title(title, fontsize="medium", loc="left")

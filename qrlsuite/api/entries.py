@@ -155,9 +155,12 @@ def board(
             return collect.select(folder, names, chosen, published, horizon)
         return studies.select(study, folder, names, published, horizon)
 
+    definitions = lookup.definitions(several(task))
     if together:
         found, left_out = across.collected(together, lambda task: select([task], entries))
-        return boards.build(found, left_out, None, horizon, alpha, by=by, together=together)
+        return boards.build(
+            found, left_out, None, horizon, alpha, by=by, together=together, definitions=definitions
+        )
     shown, left_out = select(task_names, entries)
     keys = {(entry.task_hash, entry.name) for entry in shown}
     family = shown
@@ -172,7 +175,7 @@ def board(
         alpha,
         lambda entry: (entry.task_hash, entry.name) in keys,
         by,
-        definitions=lookup.definitions(several(task)),
+        definitions=definitions,
     )
 
 
@@ -202,12 +205,13 @@ def write_page(
     from qrlsuite.leaderboard import report
     from qrlsuite.leaderboard.shelf import published_studies
 
-    tasks = collect.task_names(runs, tasks, published)
     asked |= {"runs": runs, "published": published, "study": study}
     beside = None if len(tasks) < 2 and by == "steps" else board(tasks, by=by, **asked)
     shown = [board(names, **asked) for names in [[task] for task in tasks] or [[]]]
     sections = tuple(section for one in shown for section in one.sections)
-    held = tasks or (sorted({section.task for section in sections}) if study is not None else [])
+    held = collect.task_names(runs, tasks, published) or (
+        sorted({section.task for section in sections}) if study is not None else []
+    )
     outcomes, unreadable = published_studies.collected(runs, held, published)
     every = (*shown, *([beside] if beside else []))
     refused = list(dict.fromkeys(line for one in every for line in one.refused)) + list(unreadable)

@@ -184,8 +184,8 @@ def evaluate(
     UnknownNameError
         If no entry, or several, have a name, or no task has the name given.
     OptionError
-        If no entry is named, the entries belong to several tasks, or a number is not positive; or agents cannot play
-        the task.
+        If neither entry nor task is named, the entries belong to several tasks, or a number is not positive; or agents
+        cannot play the task.
     StoreError
         If an entry has no trained agent.
     """
@@ -219,7 +219,9 @@ def evaluate(
         played = [evaluation.trained(store, *more) for store in stores]
         elsewhere = [each.play(episodes, seed, report) for each in deployed]
         elsewhere += [evaluation.trained(store, *more, scale) for store in stores for scale in perturb]
-        entry = evaluation.trained_entry(stores[0], on) if stores else resolve(task or "", "mlp")
+        entry = (
+            evaluation.trained_entry(stores[0], on) if stores else replace(resolve("beam6g", "mlp"), task=on)
+        )
         references = evaluation.references(entry, episodes, seed, report)
     finally:
         bar.stop()

@@ -425,9 +425,9 @@ class RunDisplay:
             self.console.print(
                 f"no seed reached a threshold: the {'lowest' if goal == 'above' else 'highest'} is "
                 f"{summary['lowest_threshold']:.4g}, the best {ranked} seen {summary['best_score']:.4g}. Entries that "
-                f"reach none are not told apart by steps: train longer (--epochs), rank by learning curves alone "
-                f"(leaderboard --by area), or {'lower' if goal == 'above' else 'raise'} the thresholds ([ranking] in "
-                "the task file) before the next entry is trained",
+                "reach none are not told apart by steps: train longer (--epochs), rank 20 seeds or more by learning "
+                f"curves alone (leaderboard --by area), or {'lower' if goal == 'above' else 'raise'} the thresholds "
+                "([ranking] in the task file) before the next entry is trained",
                 markup=False,
                 soft_wrap=True,
             )

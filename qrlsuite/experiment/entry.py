@@ -165,6 +165,9 @@ class Entry:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""
         tuned = {} if self.tuning is None else {"tuning": self.tuning}
         planned = {} if self.plan is None else {"plan": self.plan}
+        file = self.task.file.model_dump(mode="json", exclude={"tuning"})
+        if self.task.name in registry.load().of(specs.TaskSpec):
+            file["ranking"].pop("policies", None)  # boards read the registered file; 0.1.1 knows no such key
         return {
             "name": self.name,
             "hash": self.hash,
@@ -174,7 +177,7 @@ class Entry:
             **planned,
             "task_name": self.task.name,
             "task_hash": self.task.hash,
-            "task_file": self.task.file.model_dump(mode="json", exclude={"tuning"}),
+            "task_file": file,
             "identity": self.identity,
         }
 

@@ -169,7 +169,7 @@ class RankingSection(options.Table):
     policies: Annotated[
         dict[
             Annotated[str, Field(pattern=r"^\w[\w .,()/-]*$", max_length=40)],
-            Annotated[float, Field(allow_inf_nan=False)],
+            Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)],
         ],
         Field(
             max_length=8, description="final scores of policies to compare with: random, the best one known"
@@ -193,6 +193,9 @@ class RankingSection(options.Table):
         ) == relative:
             kind = "epsilon" if relative else "threshold"
             raise ValueError(f"the reference cell needs {kind} and delta, as the grid has {kind}s")
+        for name, score in self.policies.items():
+            if relative and not 0 <= score <= 1:
+                raise ValueError(f"policies.{name} = {score:g}: scores of this task are shares, from 0 to 1")
         for horizon in self.horizons:
             if self.horizons.count(horizon) > 1:
                 raise ValueError(f"horizons: {horizon} is there twice")

@@ -59,6 +59,9 @@ def test_a_run_says_where_entries_have_another_definition_of_its_task(task: str,
         board = json.loads(qrlsuite("leaderboard", "--format", "json", "--task", task, *words[-2:]).stdout)
         assert {len(section["rows"]) for section in board["sections"]} == {ranked}
         assert len(board["refused"]) == 3 - ranked
+        page = tmp_path / "board.html"
+        qrlsuite("leaderboard", "--format", "html", "--out", str(page), "--task", task, *words[-2:])
+        assert f"{ranked} entr{'y' if ranked == 1 else 'ies'} on 1 task" in page.read_text()
 
 
 def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> None:

@@ -40,6 +40,8 @@ degree = 3 => degree = [{5000}]{5000} => not valid TOML: too large a value: maxi
 deltas = [0.5, 0.75] => deltas = [0.5, 1.5] => ranking.deltas.1 = 1.5
 deltas = [0.5, 0.75] => deltas = [0.5]\npolicies = {random = nan} => ranking.policies.random = nan
 deltas = [0.5, 0.75] => deltas = [0.5]\npolicies = {"<b>" = 0.1} => ranking.policies
+deltas = [0.5, 0.75] => deltas = [0.5]\npolicies = {random = 22.0} => random = 22: scores of this task
+deltas = [0.5, 0.75] => deltas = [0.5]\npolicies = {random = true} => ranking.policies.random = True
 deltas = [0.5, 0.75] => deltas = [0.5, 0.5] => deltas: 0.5 is there twice
 epsilons = [0.6, 0.8] =>  => give either epsilons
 epsilons = [0.6, 0.8] => epsilons = [0.6, 0.8, 0.60] => epsilons: 0.6 is there twice, and its cells would

@@ -20,6 +20,7 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.boards import board, steps
 from qrlsuite.leaderboard.boards.compared import compare_entries
+from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.pictures import tiers
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -219,3 +220,14 @@ def test_a_published_variant_of_a_task_is_known_by_its_name(tmp_path: Path) -> N
     assert {row.entry.task for row in section.rows} == {"beam6g+7d1167f1"}
     with pytest.raises(UnknownNameError, match="did you mean 'beam6g'"):
         api.board("beam6g+7d1167f1", runs=tmp_path)
+
+
+def test_stated_scores_of_policies_do_not_split_the_vote_on_the_cells() -> None:
+    def stating(policies: dict[str, float], **cells: object) -> EntryResults:
+        one = boards.entry("one")
+        ranking = one.task_file.ranking.model_copy(update={"policies": policies, **cells})
+        return replace(one, task_file=one.task_file.model_copy(update={"ranking": ranking}))
+
+    split = [*[stating({})] * 2, *[stating({"random": 0.3})] * 2]
+    made = ranking_of([*split, *[stating({}, epsilons=[0.5, 0.6])] * 3])
+    assert (made.epsilons, made.policies) == (split[0].task_file.ranking.epsilons, {"random": 0.3})

@@ -80,7 +80,7 @@ def evaluate(
     policy, so the choice does not raise the result. Agents act as in validation. It shows sums of rewards and,
     where the task knows a maximum, relative scores. The random policy is always there; an environment may offer
     others (beam6g: the optimal one and the nearest antenna). A task file may state their scores ([ranking.policies]):
-    boards and pictures show them.
+    boards and learning curves show them.
 
     With --task OTHER, TASK/ENTRY plays another task than it was trained on, if observations and actions are the same.
 

@@ -36,7 +36,7 @@ def view(
     tasks = collect.task_names(runs, [task] if task else [], published)
 
     def render() -> str:
-        board = api.board(tasks, runs=runs, published=published)
+        board = api.board(task, runs=runs, published=published)
         studies, unreadable = published_studies.collected(runs, tasks, published)
         shown = replace(board, refused=(*board.refused, *unreadable))
         return report.render(shown, studies=studies, live=True)
