@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.cli.app import build
+from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import LearningCurves, Verdict, compare
 from tests.docs import load
@@ -166,3 +167,52 @@ def test_what_the_board_of_clifford_says() -> None:
         assert share in pairs[f"`iqp` against {asked}"]
     assert "It needs 37% and 30% more steps." in text
     assert "behind the circuit, by 4 percent." in text
+
+
+@pytest.mark.parametrize(
+    ("task", "title", "shares"),
+    [
+        ("cartpole", "CartPole with PPO", {"width 8": "31% fewer", "its mean-field control": "27% more"}),
+        ("channel", "Error channels", {"tanh": "17% more", "sines": "18% more"}),
+    ],
+)
+def test_what_the_boards_with_ppo_say(task: str, title: str, shares: dict[str, str]) -> None:
+    text = " ".join(PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0].split())
+    section = main_section(api.board(task, published=True, runs="none").sections)
+    facts = section.as_dict()
+    rows = {row["entry"]: row for row in facts["rows"] if row["label"].startswith("ppo ")}
+    hours = sum(row["tuning"]["core_hours"] for row in rows.values())
+    spent = sum(float(row["core_hours"]) for row in rows.values())
+    assert f"The searches took {hours:.2f} core-hours, the 400 runs {spent:.2f}." in text
+    pairs = {row[1]: row[2:] for row in load("tables").pairs(task)}
+    for asked, share in shares.items():
+        assert share in pairs[f"`iqp` against {asked}"][0]
+    order = [row["entry"] for row in facts["times"]["entries"]]
+    names = [load("tables")._short(rows[entry]["label"]) if entry in rows else "" for entry in order]
+    better = {
+        (names[one], names[other])
+        for one, row in enumerate(facts["times"]["adjusted_p"])
+        for other, p in enumerate(row)
+        if p is not None and p <= 0.05 and one < other
+    }
+    if task == "cartpole":
+        ahead = {"tanh", "sines", "iqp", "iqp mean-field", "iqp separable"}
+        assert {one for one, other in better if other == "width 8"} >= ahead
+        assert ("iqp mean-field", "iqp") in better
+        assert not better & {
+            ("iqp separable", "iqp"),
+            ("iqp", "iqp separable"),
+            ("tanh", "iqp"),
+            ("sines", "iqp"),
+        }
+        times = dict(zip(names, (row["mean_time"] for row in facts["times"]["entries"])))
+        slow = [row["mean_time"] for row in facts["times"]["entries"] if row["entry"] not in rows]
+        assert (
+            f"{times['width 64'] / max(slow):.0%} to {times['width 8'] / min(slow):.0%} of the steps" in text
+        )
+    else:
+        assert {("tanh", "iqp"), ("sines", "iqp"), ("iqp separable", "iqp")} <= better
+        assert not better & {("width 6", "iqp"), ("iqp", "width 6"), ("iqp", "iqp mean-field")}
+        assert (
+            f"names {max(row['final_score'] for row in rows.values()):.0%}".replace("%", " percent") in text
+        )
