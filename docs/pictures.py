@@ -76,7 +76,10 @@ Picture = Plot | Screenshot | Unpublished
 BOARD = "leaderboard --published --task beam6g --format html"
 PICTURES: dict[str, Picture] = {
     "field.png": Plot("plot field --task beam6g", ()),
-    "cartpole.png": Plot("plot curves --task cartpole --published", ("entries/cartpole/*",)),
+    "cartpole.png": Plot(
+        "plot curves --task cartpole --published --entry reinforce-mlp-08663f8a --entry reinforce-vqc-native-f64996c4",
+        ("entries/cartpole/reinforce*",),
+    ),
     "curves.png": Plot(
         "plot curves --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=16 lr=0.002' "
         "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
