@@ -219,9 +219,10 @@ def evaluate(
         played = [evaluation.trained(store, *more) for store in stores]
         elsewhere = [each.play(episodes, seed, report) for each in deployed]
         elsewhere += [evaluation.trained(store, *more, scale) for store in stores for scale in perturb]
-        entry = (
-            evaluation.trained_entry(stores[0], on) if stores else replace(resolve("beam6g", "mlp"), task=on)
-        )
+        if on is not None and not stores:  # policies need its environment alone, any model will do
+            entry = replace(resolve("beam6g", "mlp"), task=on)
+        else:
+            entry = evaluation.trained_entry(stores[0], on)
         references = evaluation.references(entry, episodes, seed, report)
     finally:
         bar.stop()

@@ -40,6 +40,10 @@ def test_a_tasks_reference_policies_play_without_entries(tmp_path: Path) -> None
     played = json.loads(say(*words, "--json").stdout)["policies"]
     assert [each["policy"] for each in played] == ["optimal", "nearest antenna", "random"]
     assert played[0]["score"]["mean"] == 1.0
+    known = json.loads(
+        say("evaluate", "--task", "beam6g+476ac3d2", "--published", "--episodes", "5", "--json").stdout
+    )
+    assert known["task"] == "beam6g+476ac3d2", "a task that only entries have"
     for more in (["--backend", "native shots=10"], ["--perturb", ".1"]):
         with pytest.raises(OptionError, match="name at least one entry to evaluate, or --task alone"):
             say(*words, *more)
