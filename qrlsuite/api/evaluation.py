@@ -118,9 +118,10 @@ class Evaluation(Shown):
 
     def _notes(self) -> list[str]:
         """Say how the agents were chosen, and what the choice promised against what came."""
-        notes = [
-            f"return: sum of rewards; {self.score}: as the task defines it; percentiles over all episodes"
-        ]
+        scores = f"{self.score}: as the task defines it; " * any(
+            each.scores is not None for each in self.policies
+        )
+        notes = [f"return: sum of rewards; {scores}percentiles over all episodes"]
         for each in self.policies:
             if not each.seeds:
                 continue
