@@ -58,16 +58,7 @@ def register_rules(register: Callable[[RuleSpec], None]) -> None:
 
 
 def load(name: str = DEFAULT) -> SignificanceRule:
-    """Return a registered rule, ready to judge; `paper` is the paper's.
-
-    Raises
-    ------
-    UnknownNameError
-        If no rule has the name.
-    PluginError
-        If a plugin's factory raises, or what it returns lacks what a rule must have; the message names the
-        distribution. The rule's later answers are checked in the same way.
-    """
+    """Return a registered rule, ready to judge; `paper` is the paper's."""
     name = DEFAULT if name == PAPER else name
     known = registry.load()
     try:

@@ -88,15 +88,7 @@ class Drawn:
 
 
 def find(name: str) -> Study:
-    """Load a study: registered, one with looks that comes with the suite, a folder with a published one, or a file.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none.
-    QrlSuiteError
-        If it is malformed, or a picture of it is unknown or cannot have its settings.
-    """
+    """Load a study: registered, one with looks that comes with the suite, a folder with a published one, or a file."""
     registered = registry.load().names(specs.StudySpec)
     if not name.endswith(".toml") and name not in registered:
         if (folder := published_studies.folder_of(name)) is None:
@@ -110,13 +102,7 @@ def find(name: str) -> Study:
 
 
 def read_outcome(name: str, runs: Path) -> StudyOutcome:
-    """Return what a study with looks has decided: in the results folder where it has begun, else as published.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there is no such study, or its results cannot be used.
-    """
+    """Return what a study with looks has decided: in the results folder where it has begun, else as published."""
     study = StudyWithLooks(find(name), runs)
     folder = published_studies.folder_of(name)
     if folder is not None and (folder == Path(name) or not study.begun):
@@ -125,13 +111,7 @@ def read_outcome(name: str, runs: Path) -> StudyOutcome:
 
 
 def check(study: Study) -> None:
-    """Check that a study's pictures exist and take its settings.
-
-    Raises
-    ------
-    UnknownNameError, OptionError
-        If a picture is unknown, or a setting is unknown or has a bad value.
-    """
+    """Check that a study's pictures exist and take its settings."""
     for place, picture in enumerate(study.file.pictures):
         location = f"{study.source}: pictures.{place}"
         if picture.kind not in pictures.KINDS:
@@ -163,11 +143,6 @@ def read(runs: Path, members: Sequence[Member], with_published: bool = False) ->
     ----------
     with_published:
         Of an entry that comes with the suite, too, the copy that gets further is read, then that with more seeds.
-
-    Raises
-    ------
-    StoreError
-        If an entry's folder is damaged.
     """
     folders = [runs, *(published.folders() if with_published else ())]
     curves_by_name = {}
@@ -214,11 +189,6 @@ def select(
     -------
     tuple
         The entries, and one line for each that was left out and why.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there is no such study, or no entry of it has a result; the message says what to type.
     """
     members = [member for member in load(name).members() if not tasks or member.entry.task.name in tasks]
     keys = {(member.entry.task.name, member.entry.name) for member in members}
@@ -273,13 +243,6 @@ def draw(
         play episodes choose among all seeds, and are not drawn.
     report:
         Told of the progress of episodes that a picture needs: policy, played, total.
-
-    Raises
-    ------
-    StoreError
-        If an entry's folder is damaged.
-    OptionError
-        If an entry has not all of the seeds.
     """
     check(study)
     own = read(runs, members)  # those who can play: agents are not published
@@ -317,13 +280,7 @@ def draw(
 
 
 def draw_outcome(outcome: StudyOutcome) -> list[Drawn]:
-    """Draw the pairs and the entries of a study with looks, and the pictures that its file names.
-
-    Raises
-    ------
-    OptionError
-        If it has taken no look yet.
-    """
+    """Draw the pairs and the entries of a study with looks, and the pictures that its file names."""
     from qrlsuite.leaderboard.pictures import outcome as drawing
 
     study = Study(outcome.study.file, outcome.study.source)
@@ -333,13 +290,7 @@ def draw_outcome(outcome: StudyOutcome) -> list[Drawn]:
 
 
 def draw_together(together: StudiesTogether) -> list[Drawn]:
-    """Draw the pairs that several studies with looks compare, task by task.
-
-    Raises
-    ------
-    OptionError
-        If no pair has a mean over the tasks.
-    """
+    """Draw the pairs that several studies with looks compare, task by task."""
     from qrlsuite.leaderboard.pictures import outcome as drawing
 
     return [Drawn("tasks", "tasks", (), figure=drawing.draw_together(together))]
@@ -352,11 +303,6 @@ def write(name: str, pictures_: Iterable[Drawn], runs: Path, format_: str) -> li
     ----------
     format_:
         `png`, `pdf` or `svg`.
-
-    Raises
-    ------
-    StoreError
-        If a file cannot be written.
     """
     written = []
     for drawn in pictures_:

@@ -199,15 +199,7 @@ class AcrossSection:
 def collected(
     tasks: Sequence[str], select: Callable[[str], tuple[list[EntryResults], list[str]]]
 ) -> tuple[list[EntryResults], list[str]]:
-    """Read the entries of several tasks, every one of which must have some; `select` reads one task's.
-
-    Raises
-    ------
-    OptionError
-        If one is named twice.
-    UnknownNameError
-        If a task has no results.
-    """
+    """Read the entries of several tasks, every one of which must have some; `select` reads one task's."""
     if len(set(tasks)) < len(tasks):
         twice = next(task for task in tasks if tasks.count(task) > 1)
         raise OptionError(f"--task: {twice} is named twice")
@@ -248,11 +240,6 @@ def shares(
         `steps`, or a key of `qrlsuite.leaderboard.boards.costs.UNITS`.
     definitions:
         See `qrlsuite.leaderboard.boards.ranked.of_one_definition`.
-
-    Raises
-    ------
-    OptionError
-        If no configuration is left; the message says what stood against it.
     """
     lines = list(refused)
     reached: dict[str, dict[str, EntryResults]] = {}

@@ -129,13 +129,6 @@ def build(
         Tasks over which the means of entries are compared, in one section.
     definitions:
         See `qrlsuite.leaderboard.boards.ranked.of_one_definition`.
-
-    Raises
-    ------
-    OptionError
-        If `alpha` is not between 0 and 1, there is no such axis, or no entry can be ranked by it.
-    PluginError
-        If a plugin's rule fails.
     """
     check_probability(alpha, "alpha")
     axes = axes_of(entries)

@@ -105,11 +105,6 @@ def compare_entries(
         The entries.
     rule:
         What counts as significant in a cell; None means the task's own, the paper's where it names none.
-
-    Raises
-    ------
-    QrlSuiteError
-        If they belong to different tasks, one is of a study with looks, or their lengths have no common horizon.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(

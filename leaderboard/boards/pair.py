@@ -262,13 +262,7 @@ class PairVerdict:
 
 
 def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: float) -> PairVerdict:
-    """Compare two entries of one task by their times below threshold and by their final scores, with all their seeds.
-
-    Raises
-    ------
-    OptionError
-        If the shorter horizon is not a whole number of epochs for both.
-    """
+    """Compare two entries of one task by times below threshold and by final scores, with all their seeds."""
     one, other = (LearningCurves(each.curves, each.steps_per_epoch, each.name) for each in (first, second))
     end = common_horizon(one, other)
     cut = [side.cut(end) for side in (one, other)]

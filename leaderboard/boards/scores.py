@@ -212,11 +212,6 @@ def rank_by_score(
         `score`, the mean over the last tenth of the epochs; `area`, the mean over all; or a cost: less is better.
     alpha:
         In (0, 1): probability of any false difference among entries of equal laws.
-
-    Raises
-    ------
-    OptionError
-        If `by` is neither, no entry has 20 seeds, or the horizon is not a whole number of epochs.
     """
     score, costs = entries[0].task_file.score, entries[0].task_file.ranking.costs
     if by not in OF_RUNS and by not in costs:
@@ -245,13 +240,7 @@ def rank_by_score(
 
 
 def _measured(entry: EntryResults, name: str) -> NDArray[np.float64]:
-    """Return what an entry's environment measured, (N, T).
-
-    Raises
-    ------
-    OptionError
-        If an epoch of a seed has no value.
-    """
+    """Return what an entry's environment measured, (N, T)."""
     values = entry.metrics.get(name)
     if values is None or np.isnan(values).any():
         raise OptionError(

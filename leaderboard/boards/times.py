@@ -234,11 +234,6 @@ def rank_by_time(
         In (0, 1): probability of any false decision among entries of equal laws; intervals have level 1 - alpha.
     shown:
         Which entries have a row; all are compared, and counted by Holm's procedure. None means all.
-
-    Raises
-    ------
-    OptionError
-        As `qrlsuite.statistics.times_board`.
     """
     curves = [LearningCurves(entry.curves, entry.steps_per_epoch, entry.name) for entry in entries]
     board = times_board(curves, grid, alpha, horizon)

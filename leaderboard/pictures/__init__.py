@@ -84,13 +84,6 @@ def draw(kind: str, entries: Sequence[EntryResults] = (), **settings: Any) -> Fi
         What it shows; empty for a picture of nothing.
     settings:
         Its options by name.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no picture of that name.
-    OptionError
-        If a setting is unknown or has a bad value, or the picture cannot be made of these entries.
     """
     if kind not in KINDS:
         raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, KINDS)}")
@@ -99,13 +92,7 @@ def draw(kind: str, entries: Sequence[EntryResults] = (), **settings: Any) -> Fi
 
 
 def format_of(path: Path | None, option: str = "--out") -> str:
-    """Return the format that a file's ending names; png without a file.
-
-    Raises
-    ------
-    OptionError
-        If it names none; the message begins with the option that gave the file.
-    """
+    """Return the format that a file's ending names; png without a file."""
     format_ = "png" if path is None else path.suffix.removeprefix(".").lower()
     if format_ not in FORMATS:
         raise OptionError(f"{option} {path}: the file's ending must be .png, .pdf or .svg")

@@ -45,11 +45,6 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw a bar per entry and cell, from the 5th to the 95th percentile a whisker.
 
     A bar whose upper percentile is the horizon is faded, as in the paper: some runs did not get there.
-
-    Raises
-    ------
-    OptionError
-        If the entries belong to different tasks, or a setting does not fit them.
     """
     chosen: BarsOptions = options.build(BarsOptions, settings, "picture 'bars'")
     cells.one_task(entries, "bars")

@@ -66,13 +66,7 @@ def choose_grid(
     deltas: Sequence[float] | None,
     thresholds: Sequence[float] | None = None,
 ) -> Grid:
-    """Return the cells that were asked for; where nothing was, those of the task's ranking grid.
-
-    Raises
-    ------
-    OptionError
-        If epsilons are asked for on a task without a known maximum, or thresholds and epsilons together.
-    """
+    """Return the cells that were asked for; where nothing was, those of the task's ranking grid."""
     ranking = entry.task_file.ranking
     chosen_deltas = deltas if deltas is not None else ranking.deltas
     if epsilons is not None and thresholds is not None:

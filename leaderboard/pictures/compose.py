@@ -66,15 +66,6 @@ def compose(
         The picture's settings by name.
     environment:
         For a picture of an environment: options that replace the task's.
-
-    Raises
-    ------
-    UnknownNameError
-        If a picture, task or entry is unknown, or there are no entries.
-    OptionError
-        If a setting is unknown or has a bad value, or the picture cannot be made of these entries or tasks.
-    PluginError
-        If a plugin's picture returns no figure.
     """
     spec = find(kind, tasks)
     selection = {"--entry": entries, "--horizon": horizon, "--seeds": seeds}
@@ -126,13 +117,7 @@ def compose(
 
 
 def describe(kind: str) -> dict[str, Any]:
-    """Describe a picture and its settings, as plain values; one of environments for each of them.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no picture of that name.
-    """
+    """Describe a picture and its settings, as plain values; one of environments for each of them."""
     lines = summaries()
     if kind not in lines:
         raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, lines)}")
@@ -165,15 +150,7 @@ def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
 
 
 def find(kind: str, tasks: Sequence[str]) -> PictureSpec | None:
-    """Return the environment's picture of that name, None for one of the suite's own kinds.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no picture of that name.
-    OptionError
-        If the tasks' environment has no such picture, or several environments have one and no task is named.
-    """
+    """Return the environment's picture of that name, None for one of the suite's own kinds."""
     if kind in pictures.KINDS:
         return None
     owners = _environment_pictures().get(kind)

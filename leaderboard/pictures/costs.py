@@ -50,11 +50,6 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
 
     An entry's steps are converted by what a step of it cost in all, see `qrlsuite.leaderboard.boards.costs.price`. An
     entry without such a cost (networks execute no circuits, exact values take no shots) has no point there.
-
-    Raises
-    ------
-    OptionError
-        If the entries belong to different tasks, or a setting does not fit them.
     """
     chosen: CostsOptions = options.build(CostsOptions, settings, "picture 'costs'")
     cells.one_task(entries, "costs")

@@ -32,13 +32,7 @@ class CurvesOptions:
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
-    """Draw the validation score of each entry against environment steps.
-
-    Raises
-    ------
-    OptionError
-        If the entries belong to different tasks.
-    """
+    """Draw the validation score of each entry against environment steps."""
     chosen: CurvesOptions = options.build(CurvesOptions, settings, "picture 'curves'")
     cells.one_task(entries, "curves")
     many = len(entries) > MANY

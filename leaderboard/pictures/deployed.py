@@ -45,11 +45,6 @@ def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figur
         One or more entries, which played the same episodes.
     values:
         The K values as they are written.
-
-    Raises
-    ------
-    OptionError
-        If no entry has a circuit, or a setting is unknown.
     """
     chosen: DeployedOptions = options.build(DeployedOptions, settings, "picture 'deployed'")
     if not any(line.deployed for line in lines):

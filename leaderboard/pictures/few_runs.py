@@ -61,11 +61,6 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw two samples of few seeds that contradict each other, all seeds, and the distribution of S_hat.
 
     The two samples are no extremes: their difference is the 5th and the 95th percentile over the draws.
-
-    Raises
-    ------
-    OptionError
-        If there are not one or two entries of one task, or one has too few seeds.
     """
     chosen: FewRunsOptions = options.build(FewRunsOptions, settings, "picture 'few-runs'")
     cells.one_task(entries, "few-runs")

@@ -54,13 +54,7 @@ Groups = dict[tuple[str, ...], dict[Any, NDArray[np.float64]]]
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
-    """Draw the mean of a field over seeds, with its interval, against another field.
-
-    Raises
-    ------
-    OptionError
-        If a field is unknown or no number, or nothing has the values asked for.
-    """
+    """Draw the mean of a field over seeds, with its interval, against another field."""
     chosen: FieldsOptions = options.build(FieldsOptions, settings, "picture 'fields'")
     if not entries:
         raise OptionError("picture 'fields' needs at least one entry")

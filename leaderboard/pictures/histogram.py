@@ -37,11 +37,6 @@ def draw(episodes: Mapping[str, ArrayLike], **settings: Any) -> Figure:
     episodes:
         For each policy, in the order of the picture, its value of every episode, any shape: (episodes,) or
         (instances, episodes). A name that begins with `optimal`, `random` or `nearest` has a fixed color.
-
-    Raises
-    ------
-    OptionError
-        If there is no policy, or one without episodes or with a value that is not finite.
     """
     chosen: HistogramOptions = options.build(HistogramOptions, settings, "picture 'histogram'")
     values = {name: _checked(name, scores) for name, scores in episodes.items()}

@@ -43,11 +43,6 @@ def draw(outcome: StudyOutcome) -> Figure:
 
     The axis is the mean time below threshold of B over that of A, in logarithms: twice as long is as far to the right
     as half as long is to the left. Lines are repeated confidence intervals. Both are cut at a factor of 10.
-
-    Raises
-    ------
-    OptionError
-        If the study has taken no look yet.
     """
     study, decision = outcome.study, outcome.state.decision
     if not any(pair.p for pair in decision.pairs):
@@ -90,11 +85,6 @@ def draw_entries(outcome: StudyOutcome) -> Figure:
     """Draw each entry that a look has reached by its mean time below threshold M, the shortest first.
 
     An entry called `X, tuned` shares the row of the entry X.
-
-    Raises
-    ------
-    OptionError
-        If the study has taken no look yet.
     """
     study, times, looked = outcome.study, outcome.mean_times(), outcome.looked
     if not times:
@@ -139,11 +129,6 @@ def draw_together(together: StudiesTogether) -> Figure:
 
     The axis is that of `draw`. A task's row has the verdict, interval and seeds of its own study; the mean is that of
     `StudiesTogether`.
-
-    Raises
-    ------
-    OptionError
-        If no pair has a mean over the tasks.
     """
     if not together.pairs:
         raise OptionError(f"no pair has a mean over the tasks: {'; '.join(together.left_out)}")

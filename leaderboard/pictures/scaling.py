@@ -67,13 +67,7 @@ class _Panel:
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
-    """Draw S_hat with its percentiles against size; the numbers at the markers are parameters.
-
-    Raises
-    ------
-    OptionError
-        If no two entries differ in size only, or a setting does not fit them.
-    """
+    """Draw S_hat with its percentiles against size; the numbers at the markers are parameters."""
     chosen: ScalingOptions = options.build(ScalingOptions, settings, "picture 'scaling'")
     if not entries:
         raise OptionError("picture 'scaling' needs at least two entries of different size")

@@ -44,13 +44,7 @@ class SurfaceOptions:
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
-    """Draw S_hat of every cell, for every entry.
-
-    Raises
-    ------
-    OptionError
-        If the entries belong to different tasks, or a setting does not fit them.
-    """
+    """Draw S_hat of every cell, for every entry."""
     chosen: SurfaceOptions = options.build(SurfaceOptions, settings, "picture 'surface'")
     cells.one_task(entries, "surface")
     horizon = cells.choose_horizon(entries, chosen.horizon)

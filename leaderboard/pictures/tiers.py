@@ -42,13 +42,7 @@ class TiersOptions:
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
-    """Draw the ranking of a task's entries on its ranking grid.
-
-    Raises
-    ------
-    OptionError
-        If the entries belong to different tasks, or a setting does not fit them.
-    """
+    """Draw the ranking of a task's entries on its ranking grid."""
     chosen: TiersOptions = options.build(TiersOptions, settings, "picture 'tiers'")
     cells.one_task(entries, "tiers")
     horizon = cells.choose_horizon(entries, chosen.horizon)

@@ -126,11 +126,6 @@ class Server(ThreadingHTTPServer):
     ----------
     port:
         None takes the first free one from 8010 on.
-
-    Raises
-    ------
-    OptionError
-        If the port is in use, or no port is free.
     """
 
     daemon_threads = True

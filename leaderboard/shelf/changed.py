@@ -34,14 +34,6 @@ def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
         A commit, or what names one to git: `origin/main`, `HEAD~1`.
     checkout:
         The repository's folder, or one below it.
-
-    Raises
-    ------
-    OptionError
-        If `base` names no commit.
-    QrlSuiteError
-        If there is no git or no repository; or a file of the change has a name or a place that no published file has,
-        or is a link.
     """
     root = Path(_git(checkout, "rev-parse", "--show-toplevel").removesuffix("\n"))
     commit = _commit(base, root)

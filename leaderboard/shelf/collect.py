@@ -117,15 +117,7 @@ def _as_published(entry: EntryResults) -> EntryResults:
 
 
 def task_names(runs: Path, tasks: Collection[str], published: bool = False) -> list[str]:
-    """Return the names of tasks, of a task file by its path: registered, or with entries here or published ones.
-
-    Raises
-    ------
-    UnknownNameError
-        With the nearest name.
-    FileError
-        If a task file cannot be read or is malformed.
-    """
+    """Return the names of tasks, of a task file by its path: registered, or with entries here or published ones."""
     return lookup.task_names(runs, tasks, also=published_entries.folders() if published else ())
 
 
@@ -152,13 +144,6 @@ def select(
     -------
     tuple
         The entries, in the order named; and one line for each that was left out and why.
-
-    Raises
-    ------
-    OptionError
-        If the horizon is a whole number of epochs of none of the tasks.
-    UnknownNameError
-        If none or several entries match a name, or none is left.
     """
     named = {
         (copy.task_hash, copy.name): copy
@@ -245,11 +230,6 @@ def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] 
         Look among the published entries that come with the suite, too.
     tasks:
         Look among the entries of these tasks only; of all where empty.
-
-    Raises
-    ------
-    UnknownNameError
-        If none or several match; the message says what to type.
     """
     return best(read_copies(runs, name, published, tasks))
 
@@ -353,13 +333,7 @@ def _task(store: EntryStore) -> str:
 
 
 def read(store: EntryStore) -> EntryResults | None:
-    """Read one entry, from runs or published; None where no run has finished an epoch.
-
-    Raises
-    ------
-    StoreError
-        If a file is damaged, a published entry is not what it says, or the seeds are of several codes.
-    """
+    """Read one entry, from runs or published; None where no run has finished an epoch."""
     found = read_each(store)
     if len(found) > 1:
         labels = listed([f"'{entry.label}'" for entry in found])
@@ -371,11 +345,6 @@ def read_each(store: EntryStore) -> list[EntryResults]:
     """Read a folder's entry, from runs or published; nothing where no run has finished an epoch.
 
     Seeds of several codes are as many entries.
-
-    Raises
-    ------
-    StoreError
-        If a file is damaged, or a published entry is not what it says.
     """
     if published_entries.is_published(store.path):
         known = published_entries.comes_with_suite(store.path)
@@ -399,11 +368,6 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
     ----------
     seeds:
         These alone; None for all.
-
-    Raises
-    ------
-    StoreError
-        If the entry's record is damaged, or no seed can be read.
     """
     record = store.record()
     first = TaskFile.model_validate(record["task_file"])
@@ -470,13 +434,7 @@ def _readable(
 
 
 def _require_independent(store: EntryStore, runs: Sequence[SeedRun]) -> set[str]:
-    """Return what probes of an entry's runs have found (`qrlsuite.results.probes`).
-
-    Raises
-    ------
-    StoreError
-        If one has found that a seed depends on the others.
-    """
+    """Return what probes of an entry's runs have found (`qrlsuite.results.probes`)."""
     made = [probe for run in runs if (probe := probes.of_record(run.record)) is not None]
     for probe in made:
         if probe["result"] == probes.DIFFERS:

@@ -249,11 +249,6 @@ class EntryResults(Shown):
         ----------
         seeds:
             A number (20: seeds 0 to 19), the seeds themselves, or text ('0:20').
-
-        Raises
-        ------
-        OptionError
-            If the entry lacks one of them.
         """
         wanted = read_seeds(seeds)
         missing = sorted(set(wanted) - set(self.seeds))
@@ -465,13 +460,7 @@ def _common_length(records: Collection[Mapping[str, Any]]) -> int:
 
 
 def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:
-    """Refuse scores that a task cannot give.
-
-    Raises
-    ------
-    StoreError
-        If one is not finite, or outside [0, 1] where the task's scores are relative to the best possible.
-    """
+    """Refuse scores that a task cannot give."""
     if not np.isfinite(scores).all():
         raise StoreError(f"{folder}: scores must be finite")
     outside = (scores < -_TOLERANCE) | (scores > 1 + _TOLERANCE)

@@ -36,12 +36,6 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     agents:
         Write the trained agents, too: of all seeds whose parameters are there, finite, and of the last epoch of the
         curves.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the entry was imported or is published already, a larger one is in its place, or it does not fit this
-        version of the suite.
     """
     if entry.source != "runs":
         raise QrlSuiteError(f"{entry.folder} is a published entry already")
@@ -85,13 +79,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
 
 
 def _agents(store: EntryStore, entry: EntryResults) -> dict[int, Arrays]:
-    """Return the trained parameters by seed: of runs that end where the curves do, and whose numbers are finite.
-
-    Raises
-    ------
-    StoreError
-        If a file is damaged.
-    """
+    """Return the trained parameters by seed: of runs that end where the curves do, and whose numbers are finite."""
     ended = store.finished(entry.seeds, entry.curves.shape[1])
     held: dict[int, Arrays] = {}
     for seed in (store.seed(seed) for seed in entry.seeds if seed in ended):

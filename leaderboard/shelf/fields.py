@@ -294,15 +294,7 @@ def _of_epochs(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
 
 
 def find(name: str, names: Iterable[str]) -> str:
-    """Return the column of a name: itself, or of an option without its side, `width` for `model.width`.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none.
-    OptionError
-        If several sides have such an option.
-    """
+    """Return the column of a name: itself, or of an option without its side, `width` for `model.width`."""
     known = list(dict.fromkeys(names))
     if name in known:
         return name

@@ -91,12 +91,6 @@ def import_points(
     -------
     list
         What was imported of each entry.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the task is not known and nothing says what a good score is, options contradict the task, a run begins after
-        the first grid point, or a score is none of the task. Nothing is written then.
     """
     given = _require_options(maximum, thresholds, every, goal)
     name = task or EXTERNAL
@@ -146,13 +140,7 @@ def _score_of(goal: Goal | None, metric: str | None, maximum: float | None) -> d
 def _require_options(
     maximum: float | None, thresholds: Sequence[float], every: int | None, goal: Goal | None
 ) -> list[float]:
-    """Return the thresholds, sorted.
-
-    Raises
-    ------
-    OptionError
-        If an option has a value that it cannot have.
-    """
+    """Return the thresholds, sorted."""
     if maximum is not None and not (math.isfinite(maximum) and maximum > 0):
         raise OptionError(f"maximum={maximum}: give the best possible score, a number above 0")
     if goal not in (None, "above", "below"):
@@ -206,13 +194,7 @@ def _first(points: Mapping[Run, Points]) -> int:
 
 
 def _on_grid(own: Points, every: int, run: Run, instead: str) -> NDArray[np.float64]:
-    """Return the scores at every grid point up to the last observation (T,): each the last at or before it.
-
-    Raises
-    ------
-    FileError
-        If the run begins after the first grid point or ends before it, or the grid is too fine.
-    """
+    """Return the scores at every grid point up to the last observation (T,): each the last at or before it."""
     of_run, last = f"{own.source}: '{run[0]}', seed {run[1]}", int(own.steps[-1])
     if own.steps[0] > every:
         raise FileError(
@@ -262,13 +244,7 @@ def _new_task(
     thresholds: list[float],
     score: Mapping[str, Any],
 ) -> TaskFile:
-    """Return the file of a task that these curves are the first of.
-
-    Raises
-    ------
-    OptionError
-        If nothing says what a good score is, or the name cannot be a task's.
-    """
+    """Return the file of a task that these curves are the first of."""
     if maximum is None and not thresholds:
         raise OptionError(
             f"'{printable(name)}' is a new task: say what a good score is with maximum=BEST (the best possible), "
@@ -329,13 +305,7 @@ def _definition(file: TaskFile) -> dict[str, Any]:
 def _require_same_options(
     file: TaskFile, maximum: float | None, thresholds: list[float], every: int | None
 ) -> None:
-    """Refuse options that contradict a task.
-
-    Raises
-    ------
-    OptionError
-        Saying what the task has.
-    """
+    """Refuse options that contradict a task."""
     step, ranking = file.protocol.interactions, file.ranking
     if every not in (None, step):
         raise OptionError(f"every={every}: task '{file.name}' has a grid of {step} steps; leave it out")
@@ -359,13 +329,7 @@ def _require_same_options(
 def _scores(
     curve: NDArray[np.float64], best: float | None, file: TaskFile, run: Run, source: str
 ) -> NDArray[np.float64]:
-    """Return scores in the unit of a task: fractions of the best one where there is one.
-
-    Raises
-    ------
-    FileError
-        If they are none of the task.
-    """
+    """Return scores in the unit of a task: fractions of the best one where there is one."""
     scores = round_means(curve if best is None or file.ranking.thresholds is not None else curve / best)
     try:
         require_scores(scores, file, Path(source))

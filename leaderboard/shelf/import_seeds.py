@@ -82,13 +82,7 @@ class Imported:
 
 
 def sources(folder: Path) -> list[EntryStore]:
-    """Return the entries of a folder: itself, or all below it, where it is a results folder or one of exports.
-
-    Raises
-    ------
-    StoreError
-        If there is none.
-    """
+    """Return the entries of a folder: itself, or all below it, where it is a results folder or one of exports."""
     if (folder / "entry.json").is_file():
         return [EntryStore(folder.resolve())]
     stores = entries(folder) if folder.is_dir() else []
@@ -108,12 +102,6 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
     ----------
     plan:
         Hash of the study with looks that the results folder belongs to, if it does.
-
-    Raises
-    ------
-    StoreError
-        If the entry was made under another definition of its task, is damaged, was not trained by this suite or
-        belongs to a study with looks; or if the seeds are being trained here.
     """
     exported = published.read(source.path) if published.is_published(source.path) else None
     entry = source.entry()  # computes the hash anew
@@ -150,13 +138,7 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
 
 
 def _place_for(store: EntryStore, source: EntryStore, exported: bool, runs: Path, entry: Entry) -> str:
-    """Return the mark of the folder that seeds go to: none beside seeds of the same code, else the one that they have.
-
-    Raises
-    ------
-    ChangedCodeError
-        If seeds of another code are there.
-    """
+    """Return the mark of the seeds' folder: empty beside seeds of the same code, else their own mark."""
     try:
         codes.require_mergeable(store, source, exported)
     except codes.ChangedCodeError:

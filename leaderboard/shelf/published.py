@@ -117,13 +117,7 @@ class PublishedEntry:
         return tuple(self.record["published"].get("agents", {}).get("seeds", ()))
 
     def parameters(self) -> dict[int, Arrays]:
-        """Return the trained parameters by seed.
-
-        Raises
-        ------
-        StoreError
-            If the file's hash is not that of the record, it is damaged, or a parameter is not a finite number.
-        """
+        """Return the trained parameters by seed."""
         path, stated = self.folder / AGENTS, self.record["published"].get("agents", {})
         if not self.agents:
             return {}
@@ -197,11 +191,6 @@ class PublishedAgents(EntryStore):
         The published entry's.
     runs:
         A results folder: evaluations are kept there, for nothing is written beside published files.
-
-    Raises
-    ------
-    StoreError
-        If the entry or its agents are damaged, or it has none.
     """
 
     def __init__(self, folder: Path, runs: Path) -> None:
@@ -282,11 +271,6 @@ def read(folder: Path, label: bool = True) -> PublishedEntry:
         Check the label, for which the algorithm's and the model's code are imported, and torch with them. Boards leave
         it out for entries that come with the suite: this file comes from the same place, and `verify` and the tests
         check them in full.
-
-    Raises
-    ------
-    StoreError
-        With the first thing that is wrong.
     """
     try:
         return _read(folder, label)
@@ -657,13 +641,7 @@ def encode_record(content: Mapping[str, Any]) -> bytes:
 
 
 def encode_agents(agents: Mapping[int, Arrays]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return what the record says of agents, and their file by name; of no agents nothing.
-
-    Raises
-    ------
-    StoreError
-        If the file would be larger than is read, or agents have other parameters than others.
-    """
+    """Return what the record says of agents, and their file by name; of no agents nothing."""
     if not agents:
         return {}, {}
     seeds = sorted(agents)

@@ -37,11 +37,6 @@ class PublishedStudy(StudyWithLooks):
         The one that `export` wrote.
     labels:
         Check the labels of its entries, see `published.read`.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the study or an entry is damaged.
     """
 
     def __init__(self, folder: Path, labels: bool = True) -> None:
@@ -100,13 +95,7 @@ def is_published(path: Path) -> bool:
 
 
 def read(folder: Path, labels: bool = True) -> StudyOutcome:
-    """Return what a published study has decided; parameters as for `PublishedStudy`.
-
-    Raises
-    ------
-    QrlSuiteError
-        If it is damaged, or a look now finds something else than it did.
-    """
+    """Return what a published study has decided; parameters as for `PublishedStudy`."""
     if not is_published(folder):
         raise StoreError(
             f"{folder} holds no {FILE}: give a study's file, or a folder that `qrlsuite export` wrote"
@@ -145,11 +134,6 @@ def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
 
     Written again while the study goes on, it holds more seeds. Nothing there is replaced by less, and the study's own
     file stays as it is: it may have been published before its first seed. `agents` writes the trained agents, too.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the study has not begun, another one is in its place, or files cannot be written.
     """
     state = study.read()
     if not state.begun:
@@ -173,13 +157,7 @@ def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
 
 
 def import_study(folder: Path, runs: Path) -> list[Imported]:
-    """Copy the seeds of a published study to a results folder, where `study run` goes on with it.
-
-    Raises
-    ------
-    QrlSuiteError
-        If another study of its name has begun there, or an entry is damaged.
-    """
+    """Copy the seeds of a published study to a results folder, where `study run` goes on with it."""
     source = PublishedStudy(folder)
     study = StudyWithLooks(load(folder), runs)
     study.begin()

@@ -113,11 +113,6 @@ def find(path: Path) -> list[Path]:
     """Return the absolute paths of the published entries at or below a folder, sorted.
 
     An entry is checked against the names of the folders that it lies in, which `.` does not have.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there is none.
     """
     place = path.absolute()
     if (place / "entry.json").exists():
@@ -183,13 +178,7 @@ def verify(
 
 
 def _check_agents(entry: PublishedEntry) -> None:
-    """Check that an entry's agents are those of its record, finite, and parameters of its model where it is installed.
-
-    Raises
-    ------
-    StoreError
-        With the first thing that is wrong.
-    """
+    """Check that agents match the record, are finite, and fit the model where it is installed."""
     agents = entry.parameters()
     if not agents or absent(entry.entry_results()):
         return

@@ -151,11 +151,6 @@ class Reinforce:
 
         Returns, per seed (S,), the number of steps learned from `learned_steps` and the policy's loss `loss`, NaN
         where no episode ended or there was no update; with a value network also its mean squared error `value_loss`.
-
-        Raises
-        ------
-        OptionError
-            If `memory` is too short for `epochs_per_update`.
         """
         memory, each = self.options.memory, self.options.epochs_per_update
         place = self.epoch % each  # among the epochs of one update

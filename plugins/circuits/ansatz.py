@@ -133,13 +133,7 @@ class BasicOptions:
 
 
 def iqp(qubits: int, layers: int, options: GateOptions) -> Circuit:
-    """Build the ring of controlled gates: control q, target (q + 1) mod n; static part: H on every qubit.
-
-    Raises
-    ------
-    OptionError
-        For fewer than two qubits.
-    """
+    """Build the ring of controlled gates: control q, target (q + 1) mod n; static part: H on every qubit."""
     if qubits == 1 and options.entangled != "separable":
         raise OptionError(
             "ansatz 'iqp' with 1 qubit: its gates are controlled by another qubit, so it needs 2 to 20; "
@@ -237,11 +231,6 @@ def perez_salinas(qubits: int, layers: int, options: PerezSalinasOptions) -> Cir
 
     The authors' gate turns about z the other way round: the state is the complex conjugate, with the same <Z>. They
     read the fidelities of label states from it.
-
-    Raises
-    ------
-    OptionError
-        For one layer with several inputs: <Z> does not depend on all of them.
     """
     inputs = options.inputs
     if layers == 1 and inputs > 1:
@@ -282,11 +271,6 @@ def wang(qubits: int, layers: int, options: WangOptions) -> Circuit:
     Of the paper the abstract was read, and of its code not the last version: that X is measured is told by the names of
     its runs (`XObs`), and where the angles of ZZ start is a guess. Their inputs are multiplied by 2 pi:
     `init_scale=6.283185307`. Their GHZ state begins at qubit 1 of 8, and they measured three qubits then.
-
-    Raises
-    ------
-    OptionError
-        For edges that are no pairs of qubits, or are there twice; or edges of another coupling than a graph state.
     """
     circuit = _begun(qubits, options.entangled)
     scaling = circuit.parameter("scaling", (layers, qubits, 3), high=1.0)

@@ -88,14 +88,7 @@ GATES: dict[tuple[str, bool], Callable[..., Any]] = {
 
 
 class PennyLaneBackend:
-    """A circuit on a PennyLane device, see `qrlsuite.circuit.CircuitBackend`.
-
-    Raises
-    ------
-    OptionError
-        If the device is unknown or its package is missing, if it lacks a gate of the circuit, or if it cannot
-        differentiate as asked.
-    """
+    """A circuit on a PennyLane device, see `qrlsuite.circuit.CircuitBackend`."""
 
     def __init__(self, circuit: Circuit, options: PennyLaneOptions) -> None:
         self.circuit = circuit
@@ -155,11 +148,6 @@ class PennyLaneBackend:
             Number of lanes, needed where no angle is variable.
         seed:
             Seed of the device's sampling; None draws fresh entropy.
-
-        Raises
-        ------
-        OptionError
-            If the device finds only now that it cannot run the circuit.
         """
         qnode = self._qnode
         if self.shots is not None and "seed" in self._device_arguments():

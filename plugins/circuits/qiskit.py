@@ -63,11 +63,6 @@ class QiskitBackend:
     ----------
     gradient:
         How it is differentiated.
-
-    Raises
-    ------
-    OptionError
-        If options contradict each other, a noise model is unknown, or an optional package is missing.
     """
 
     def __init__(self, circuit: Circuit, options: QiskitOptions) -> None:

@@ -27,11 +27,6 @@ class Runtime:
         A `QuantumCircuit` with R parameters.
     observables:
         `SparsePauliOp`s on its qubits.
-
-    Raises
-    ------
-    OptionError
-        If the device is out of service, or cannot run the circuit.
     """
 
     def __init__(self, options: QiskitOptions, device: Any, circuit: Any, observables: Sequence[Any]) -> None:
@@ -121,13 +116,7 @@ def fake_device(name: str) -> bool:
 
 
 def open_device(name: str) -> Any:
-    """Return one of IBM's devices by its name, from the account that is saved on this machine.
-
-    Raises
-    ------
-    OptionError
-        If there is no account, or no such device.
-    """
+    """Return one of IBM's devices by its name, from the account that is saved on this machine."""
     from qiskit_ibm_runtime import QiskitRuntimeService
     from qiskit_ibm_runtime.accounts import AccountNotFoundError
 

@@ -57,13 +57,7 @@ PASSED_ON = ("QRLSUITE_", "PYTHONPATH", "NUMBA_")
 
 
 def _template(text: str) -> str:
-    """Check a template.
-
-    Raises
-    ------
-    ValueError
-        If a worker's command has no place in it, or it has an unknown one.
-    """
+    """Check a template."""
     try:
         names = [name for _, name, _, _ in string.Formatter().parse(text) if name is not None]
     except ValueError as error:
@@ -116,13 +110,7 @@ class CommandEngine:
         return set()
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
-        """Train the groups until all have finished or failed.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After Ctrl-C, when every worker that had begun has saved and ended.
-        """
+        """Train the groups until all have finished or failed."""
         jobs = [_CommandJob(work, group, works) for work in works for group in work.groups]
         waiting, running = deque(jobs), list[_CommandJob]()
         free = deque(range(1, works[0].workers + 1))

@@ -93,13 +93,7 @@ class DaskEngine:
         return train_remotely(self, works, show)
 
     def connect(self, workers: int, versions: Mapping[str, str | None]) -> DaskLink:
-        """Connect to the scheduler, or start one with as many workers on this machine.
-
-        Raises
-        ------
-        QrlSuiteError
-            If none answers, or it is of another version.
-        """
+        """Connect to the scheduler, or start one with as many workers on this machine."""
         return DaskLink(self.options, workers, versions)
 
 
@@ -137,13 +131,7 @@ class DaskLink:
             self._exit = exit_stack.pop_all()
 
     def _require_version(self) -> None:
-        """Refuse a scheduler whose Dask or Python is not ours.
-
-        Raises
-        ------
-        QrlSuiteError
-            Naming both versions.
-        """
+        """Refuse a scheduler whose Dask or Python is not ours."""
         found = self._client.get_versions()
         ours, theirs = found["client"]["packages"], found["scheduler"]["packages"]
         here, there = (
@@ -178,13 +166,7 @@ class DaskLink:
         )
 
     def receive(self, seconds: float) -> list[Answer]:
-        """Return the answers that have come, waiting for the first of them that long at most.
-
-        Raises
-        ------
-        QrlSuiteError
-            If the scheduler is gone, or none of the workers has our versions.
-        """
+        """Return the answers that have come, waiting for the first of them that long at most."""
         deadline = time.monotonic() + seconds
         while True:
             if self._client.status not in ("running", "connecting"):
@@ -243,13 +225,7 @@ class DaskLink:
             log.warning(f"the Dask scheduler at {self.address} has no worker: waiting for one")
 
     def _stranded(self) -> list[Answer]:
-        """Return as lost the tasks that only workers that are gone may do.
-
-        Raises
-        ------
-        QrlSuiteError
-            If there are workers, and none has our versions.
-        """
+        """Return as lost the tasks that only workers that are gone may do."""
         if self._refused and not self._usable:
             reasons = [f"{address} has {reason}" for address, reason in sorted(self._refused.items())]
             raise QrlSuiteError(
@@ -284,13 +260,7 @@ class DaskLink:
 
 
 def _connected(address: str, timeout: float) -> Any:
-    """Return a client of the scheduler at an address.
-
-    Raises
-    ------
-    QrlSuiteError
-        If none answers there.
-    """
+    """Return a client of the scheduler at an address."""
     distributed = _module("distributed")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in our words
     try:

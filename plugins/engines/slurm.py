@@ -50,13 +50,7 @@ _TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
 
 
 def minutes(text: Any) -> int:
-    """Read a time limit as SLURM writes it: minutes, `mm:ss`, `hh:mm:ss`, `d-hh`, `d-hh:mm`, `d-hh:mm:ss`.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these, or less than a minute.
-    """
+    """Read a time limit as SLURM writes it: minutes, `mm:ss`, `hh:mm:ss`, `d-hh`, `d-hh:mm`, `d-hh:mm:ss`."""
     match = _TIME.fullmatch(str(text).strip())
     if match is None:
         raise ValueError("write minutes (90), hh:mm:ss (2:00:00) or d-hh:mm:ss (1-12:00:00)")
@@ -102,13 +96,7 @@ class ArrayTask:
         self._engine: LocalEngine | None = None
 
     def __call__(self) -> None:
-        """Supervise the group's worker until it has finished.
-
-        Raises
-        ------
-        QrlSuiteError
-            If it failed; SLURM then shows the task as failed, and its log has the message.
-        """
+        """Supervise the group's worker until it has finished."""
         signal.signal(signal.SIGTERM, _canceled)
         self._engine = LocalEngine()
         group = SeedGroup(self.seeds, 0)
@@ -147,13 +135,7 @@ class SlurmEngine:
         return requested or TASKS
 
     def queued(self, store: EntryStore) -> set[int]:
-        """Return the seeds whose tasks SLURM still knows as waiting or running.
-
-        Raises
-        ------
-        QrlSuiteError
-            If there are submitted tasks and `squeue` does not answer.
-        """
+        """Return the seeds whose tasks SLURM still knows as waiting or running."""
         tasks = submitted(store)
         if not tasks:
             return set()
@@ -163,13 +145,7 @@ class SlurmEngine:
         return {seed for task in tasks if task["job"] in waiting for seed in task["seeds"]}
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
-        """Submit the groups of each work as one job array, and return.
-
-        Raises
-        ------
-        QrlSuiteError
-            If there is no SLURM here, or it refuses the job; the message has SLURM's own.
-        """
+        """Submit the groups of each work as one job array, and return."""
         outcome = EngineOutcome()
         for work in works:
             outcome += self._submit(work)
@@ -237,13 +213,7 @@ def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[SeedGroup]
 
 
 def _waiting() -> set[str]:
-    """Return the ids of all jobs that wait or run, array tasks as `123_4`; of all users, who may share a folder.
-
-    Raises
-    ------
-    QrlSuiteError
-        If `squeue` is missing or does not answer.
-    """
+    """Return the ids of all jobs that wait or run, array tasks as `123_4`; of all users, who may share a folder."""
     command = ["squeue", "--noheader", "--array", "--format", "%i"]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_SECONDS, check=True)

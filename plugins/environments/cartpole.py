@@ -126,11 +126,6 @@ class CartPole(CartPoleEnv):
     ## Version History
 
     * v1: Gymnasium's CartPole-v1.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used; the message lists every problem.
     """
 
     def __init__(
@@ -207,11 +202,6 @@ class CartPoleLanes(LaneEnv):
         """Begin a new episode in every lane; returns observations (L, 4) and an empty dictionary.
 
         `options={"state": (L, 4)}` gives the starting states instead of drawing them.
-
-        Raises
-        ------
-        qrlsuite.errors.OptionError
-            If `options` has another key than `state`, or it has another shape.
         """
         settings = dict(options or {})
         start = settings.pop("state", None)
@@ -240,15 +230,7 @@ class CartPoleLanes(LaneEnv):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Push the carts, `actions` (L,): 0 to the left, 1 to the right.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        gymnasium.error.InvalidAction
-            If an action is neither 0 nor 1.
-        """
+        """Push the carts, `actions` (L,): 0 to the left, 1 to the right."""
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
@@ -266,13 +248,7 @@ class CartPoleLanes(LaneEnv):
         return self._observations(), rewards, terminated, truncated, infos
 
     def state_dict(self) -> State:
-        """Return the episodes' state, lane-first: `state` (L, 4), `step` (L,) and `ended` (L,).
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        """
+        """Return the episodes' state, lane-first: `state` (L, 4), `step` (L,) and `ended` (L,)."""
         if not self._begun:
             raise ResetNeeded("call reset() before state_dict()")
         return {
@@ -282,13 +258,7 @@ class CartPoleLanes(LaneEnv):
         }
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes.
-
-        Raises
-        ------
-        qrlsuite.errors.StoreError
-            If an array is missing or has another shape; nothing is changed then.
-        """
+        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes."""
         shapes = {"state": (self.num_envs, 4), "step": (self.num_envs,), "ended": (self.num_envs,)}
         require_state("cartpole", state, shapes)
         if state["step"].min() < 0 or state["step"].max() > self.options.steps:
@@ -358,12 +328,6 @@ def push(
 
 
 def parse(values: Mapping[str, Any]) -> CartPoleOptions:
-    """Return the options that `values` describe.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If a key is unknown or a value cannot be used; the message lists every problem.
-    """
+    """Return the options that `values` describe."""
     options: CartPoleOptions = option_words.build(CartPoleOptions, values, "environment 'cartpole'")
     return options

@@ -94,11 +94,6 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     points: NDArray[np.float32]
@@ -136,13 +131,6 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
         """Name the class of the point that was shown.
 
         The observation after the last step is the last point again.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset, or the episode has ended.
-        gymnasium.error.InvalidAction
-            If the action is not in 0..3.
         """
         if not len(self.points) or self._taken == self.options.steps:
             raise ResetNeeded("call reset() before step()")

@@ -94,11 +94,6 @@ class Pong(OneLane):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}

@@ -89,11 +89,6 @@ class Room(OneLane):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}

@@ -36,13 +36,7 @@ class CNNOptions:
 
 
 class CNN(nn.Module):
-    """One agent's network, (B, inputs) -> (B, outputs); inputs are flat, as lanes give them.
-
-    Raises
-    ------
-    OptionError
-        If observations are no images, or smaller than the windows.
-    """
+    """One agent's network, (B, inputs) -> (B, outputs); inputs are flat, as lanes give them."""
 
     def __init__(
         self,

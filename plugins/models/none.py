@@ -16,13 +16,7 @@ class NoneOptions:
 
 
 def build(obs_dim: int, out_dim: int, options: NoneOptions, generator: Any) -> NoReturn:
-    """Refuse to build a network.
-
-    Raises
-    ------
-    OptionError
-        Always.
-    """
+    """Refuse to build a network."""
     raise OptionError(
         "model 'none' is for algorithms that build no network, and this one does: choose a model"
     )

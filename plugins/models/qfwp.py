@@ -93,13 +93,7 @@ class QFWP(Remembering):
 def build(
     obs_dim: int, out_dim: int, options: QFWPOptions, generator: torch.Generator, role: str = "network"
 ) -> nn.Module:
-    """Build one agent's network with every random number drawn from `generator`, see `vqc.build`.
-
-    Raises
-    ------
-    OptionError
-        If the ansatz cannot be built with these options, or does not fit the task without linear layers.
-    """
+    """Build one agent's network with every random number drawn from `generator`, see `vqc.build`."""
     if role == "critic" and options.critic == "mlp":
         return vqc.build(obs_dim, out_dim, options, generator, role)
     runner = vqc._Runner(options)

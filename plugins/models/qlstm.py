@@ -132,13 +132,7 @@ class QLSTM(Remembering):
 def build(
     obs_dim: int, out_dim: int, options: QLSTMOptions, generator: torch.Generator, role: str = "network"
 ) -> nn.Module:
-    """Build one agent's quantum LSTM with every random number drawn from `generator`, see `vqc.build`.
-
-    Raises
-    ------
-    OptionError
-        If the ansatz cannot be built with these options, or does not fit the task without linear layers.
-    """
+    """Build one agent's quantum LSTM with every random number drawn from `generator`, see `vqc.build`."""
     if role == "critic" and options.critic == "mlp":
         return vqc.build(obs_dim, out_dim, options, generator, role)
     runner = vqc._Runner(options)
@@ -155,13 +149,7 @@ def build(
 
 
 def population(modules: Sequence[Any], options: VQCOptions) -> nn.Module:
-    """Stack built networks that remember, or perceptrons of critics.
-
-    Raises
-    ------
-    OptionError
-        If the backend cannot run the circuit.
-    """
+    """Stack built networks that remember, or perceptrons of critics."""
     first = modules[0]
     if not isinstance(first, Remembering):
         return vqc.population(modules, options)

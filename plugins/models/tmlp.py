@@ -51,13 +51,7 @@ class TMLPOptions:
         return round(math.pow(self.width, 1 / self.cores))
 
     def check(self) -> None:
-        """Refuse a width that is no power.
-
-        Raises
-        ------
-        OptionError
-            If `width` is no number to the power `cores`.
-        """
+        """Refuse a width that is no power."""
         near = max(self.size, 2) ** self.cores
         if near != self.width:
             raise OptionError(

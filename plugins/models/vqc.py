@@ -180,13 +180,7 @@ class VQCOptions:
         return options_on(cls, backend)
 
     def check(self) -> None:
-        """Build the circuit once, so that one that cannot be built is refused before anything is trained.
-
-        Raises
-        ------
-        UnknownNameError, OptionError
-            If there is no such ansatz, it has no such size, option or parameter, or the backend cannot compute it.
-        """
+        """Build the circuit once, so that one that cannot be built is refused before anything is trained."""
         circuit = build_circuit(self)
         if self.train not in ("all", "linear", *circuit.parameters):
             choices = ("all", "linear", *circuit.parameters)
@@ -391,13 +385,7 @@ class VQC(_Hybrid):
 
 
 class VQCPopulation(_Hybrid):
-    """S hybrid models: (S, B, in) -> (S, B, out); parameters and buffers as in `VQC` with a leading axis S.
-
-    Raises
-    ------
-    OptionError
-        If the backend cannot run the circuit.
-    """
+    """S hybrid models: (S, B, in) -> (S, B, out); parameters and buffers as in `VQC` with a leading axis S."""
 
     def __init__(self, modules: Sequence[VQC], options: VQCOptions) -> None:
         runner = _Runner(options)
@@ -413,13 +401,7 @@ class VQCPopulation(_Hybrid):
 
 
 def build_circuit(options: VQCOptions) -> Circuit:
-    """Build the circuit that the options describe.
-
-    Raises
-    ------
-    OptionError
-        If the ansatz has no such option or size, or not the qubits that the readout needs.
-    """
+    """Build the circuit that the options describe."""
     ansatz_options: dict[str, Any] = dict(options.ansatz_options)
     if "gate" in field_names(specs.resolve(registry.get(specs.AnsatzSpec, options.ansatz).options)):
         ansatz_options.setdefault("gate", options.gate)
@@ -468,11 +450,6 @@ def build(
         Source of the initial parameters and of the key of shot noise.
     role:
         `"critic"` may be a perceptron, as the options say.
-
-    Raises
-    ------
-    OptionError
-        If the ansatz cannot be built with these options, or does not fit the task without linear layers.
     """
     if role == "critic" and options.critic == "mlp":
         return mlp.build(obs_dim, out_dim, mlp.MLPOptions(), generator)

@@ -39,11 +39,6 @@ def identity(run: Mapping[str, Any]) -> str:
     """Return the 8 characters under which a tracker knows this run, resumed or not: `tracking-id` in its folder.
 
     They are drawn when the run is first tracked. Results that are deleted and trained again are another run.
-
-    Raises
-    ------
-    StoreError
-        If the file holds something else: it becomes part of names of folders.
     """
     path = Path(run["folder"], "tracking-id")
     if not path.exists():

@@ -34,11 +34,6 @@ class WandB:
     ----------
     target:
         The folder to write below; None for the seeds' own folders.
-
-    Raises
-    ------
-    QrlSuiteError
-        If `WANDB_MODE=online` and nobody is logged in.
     """
 
     _runs: ClassVar[

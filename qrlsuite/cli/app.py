@@ -196,13 +196,7 @@ def load(command: LazyCommand) -> Any:
 
 
 def split_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a command's words without `--plugin PATH`, and the paths: what these register is what words name.
-
-    Raises
-    ------
-    OptionError
-        If the last one has no path.
-    """
+    """Return a command's words without `--plugin PATH`, and the paths: what these register is what words name."""
     rest, paths = list[str](), list[str]()
     left = iter(words)
     for word in left:

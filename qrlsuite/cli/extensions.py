@@ -13,13 +13,7 @@ from qrlsuite.registry import Registry, words
 
 
 def add_commands(app: typer.Typer, registry: Registry) -> None:
-    """Call every plugin's `register_commands`.
-
-    Raises
-    ------
-    PluginError
-        If one fails, and problems of plugins are fatal (`qrlsuite --strict`).
-    """
+    """Call every plugin's `register_commands`."""
     taken = {_name(info) for info in (*app.registered_commands, *app.registered_groups)}
     for implementation in registry.manager.hook.register_commands.get_hookimpls():
         before = list(app.registered_commands), list(app.registered_groups), app.registered_callback

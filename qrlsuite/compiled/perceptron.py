@@ -41,11 +41,6 @@ def perceptron(
     -------
     Tensor
         (S, B, out), differentiable once. A seed's numbers have the same bits in any population.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit: compiled loops would read what is beside an array.
     """
     return Sweep(weights, biases, activation)(x)
 
@@ -60,11 +55,6 @@ class Sweep:
         of the layers lie one behind the other (`in_one_block`), else copied.
     activation:
         "none", "relu" or "sin", after every layer but the last.
-
-    Raises
-    ------
-    ValueError
-        If their shapes do not fit.
     """
 
     def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: str) -> None:
@@ -79,26 +69,14 @@ class Sweep:
         self._kept_parts: list[Tensor] = []
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Map (S, B, in) to (S, B, out).
-
-        Raises
-        ------
-        ValueError
-            If the shape does not fit.
-        """
+        """Map (S, B, in) to (S, B, out)."""
         if torch.is_grad_enabled() and (x.requires_grad or any(each.requires_grad for each in self.tensors)):
             result: Tensor = _Perceptron.apply(x, self, *self.tensors)  # type: ignore[no-untyped-call]
             return result
         return torch.from_numpy(self.values(array(x), False)[0])
 
     def values(self, x: Array, keep: bool) -> tuple[Array, _Records]:
-        """Return outputs (S, B, out) of x (S, B, in), and the records of the pass, all of them if `keep`.
-
-        Raises
-        ------
-        ValueError
-            If the shape does not fit.
-        """
+        """Return outputs (S, B, out) of x (S, B, in), and the records of the pass, all of them if `keep`."""
         if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.sizes[0]:
             raise _misfit(x.shape, self.shapes)
         chunks = self.seeds * -(-x.shape[1] // WIDE) if keep else 1
@@ -221,13 +199,7 @@ def _plan(sizes: tuple[int, ...], activation: str) -> tuple[int, int, list[tuple
 
 
 def _sizes(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> NDArray[np.int64]:
-    """Return inputs and outputs of the layers.
-
-    Raises
-    ------
-    ValueError
-        If the shapes of the layers do not fit each other.
-    """
+    """Return inputs and outputs of the layers."""
     shapes = [each.shape for pair in zip(weights, biases) for each in pair]
     fits = len(weights) == len(biases) > 0 and all(len(shape) == 3 for shape in shapes[::2])
     sizes = [shapes[0][-1], *(shape[1] for shape in shapes[::2])] if fits else []

@@ -40,13 +40,7 @@ class Points(NamedTuple):
 
 
 def draw(circuit: Circuit, count: int, seed: int = 0) -> Points:
-    """Draw inputs of a standard normal, and parameters as they are initially.
-
-    Raises
-    ------
-    OptionError
-        If the circuit has no parameters.
-    """
+    """Draw inputs of a standard normal, and parameters as they are initially."""
     if circuit.parameter_count == 0:
         raise OptionError("the circuit has no parameters: diagnostics say how results change with them")
     source = np.random.default_rng(seed)
@@ -85,13 +79,7 @@ def _measuring(circuit: Circuit, observables: list[Any]) -> Circuit:
 def gradients(
     circuit: Circuit, draws: int = 100, seed: int = 0, report: Report = lambda done: None
 ) -> dict[str, Array]:
-    """Return the derivatives (draws, P) of each readout by all parameters.
-
-    Raises
-    ------
-    OptionError
-        If the circuit has no parameters, or is too large.
-    """
+    """Return the derivatives (draws, P) of each readout by all parameters."""
     points = draw(circuit, draws, seed)
     names = list(readouts(circuit))
     together = _measuring(circuit, [0, tuple(range(_named(circuit)))][: len(names)])
@@ -103,11 +91,6 @@ def fisher(circuit: Circuit, draws: int = FISHER_DRAWS, seed: int = 0) -> list[I
     """Return the Fisher information J^T J of the circuit's expectation values at each draw of the parameters.
 
     Each is the mean over as many inputs as it takes to see all P directions.
-
-    Raises
-    ------
-    OptionError
-        If the circuit has no parameters, or is too large.
     """
     inputs = -(-2 * circuit.parameter_count // len(circuit.observables)) + 8
     points = draw(circuit, draws, seed)
@@ -150,11 +133,6 @@ def spectrum(circuit: Circuit, points: Points) -> tuple[Array, Array]:
     -------
     tuple
         Frequencies (F,), 1 for one wave in a turn, and their power, the constant's (frequency 0) first.
-
-    Raises
-    ------
-    OptionError
-        If an input is multiplied by another, or frequencies are too high to be sampled.
     """
     count, features = len(points.inputs), min(circuit.inputs, MOST_INPUTS)
     bound = max(highest_frequency(circuit, each, points.parameters) for each in range(features))
@@ -189,13 +167,7 @@ def expectation_values(circuit: Circuit, points: Points) -> Array:
 
 
 def final_states(circuit: Circuit, points: Points) -> states.States:
-    """Return the circuit's final states (N, 2^n).
-
-    Raises
-    ------
-    OptionError
-        If it is a mean-field approximation, which has none.
-    """
+    """Return the circuit's final states (N, 2^n)."""
     import torch
 
     backend: Any = create_backend("native", _measuring(circuit, [0]))

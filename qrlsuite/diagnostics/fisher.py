@@ -100,11 +100,6 @@ def effective_dimension(
     -------
     float
         0 where no parameter has an effect.
-
-    Raises
-    ------
-    ValueError
-        If n and gamma are so small that k is not above 1.
     """
     k = gamma * samples / (2 * math.pi * math.log(samples)) if samples > 1 else 0.0
     if not (k > 1.0 and 0.0 < gamma <= 1.0):

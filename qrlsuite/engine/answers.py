@@ -77,13 +77,7 @@ class Asked:
 def require_fit(
     header: Mapping[str, Any], arrays: Arrays, asked: Asked, task: TaskFile, expected: Expected
 ) -> None:
-    """Refuse an answer that is not one to the task that is waited for.
-
-    Raises
-    ------
-    StoreError
-        With the first thing that does not fit.
-    """
+    """Refuse an answer that is not one to the task that is waited for."""
     problem = next(_problems(header, arrays, asked, task, expected), None)
     if problem is not None:
         raise StoreError(f"an answer does not fit its task: {problem}")
@@ -226,11 +220,6 @@ def require_alike(
     """Refuse two workers' answers to one task that differ in a bit of the lines or the checkpoint.
 
     On another kind of processor the last bits differ rightly: such answers say nothing about each other.
-
-    Raises
-    ------
-    StoreError
-        Naming both workers.
     """
     made = [header.get("provenance") or {} for header in (first, second)]
     if made[0].get("processor") != made[1].get("processor") or made[0].get("device") != made[1].get("device"):

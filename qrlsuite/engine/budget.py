@@ -20,16 +20,7 @@ class Budget:
 
     @classmethod
     def parse(cls, text: str) -> Budget:
-        """Read `90s`, `30min`, `8h`, `1h30min` or `2core-hours`.
-
-        Raises
-        ------
-        OptionError
-            If it is nothing of that kind, or nothing at all.
-
-        >>> Budget.parse("1h 30min").time, Budget.parse("2core-hours").core_hours
-        (5400.0, 2.0)
-        """
+        """Read `90s`, `30min`, `8h`, `1h30min` or `2core-hours`."""
         pieces = _PIECE.findall(text.strip().lower())
         rest = _PIECE.sub("", text.strip().lower()).strip()
         cores = [float(number) for number, unit in pieces if unit.startswith("core")]

@@ -89,13 +89,7 @@ class LocalEngine:
         return set()
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
-        """Train groups in worker processes until all have finished or failed.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After Ctrl-C, when every worker has saved and ended.
-        """
+        """Train groups in worker processes until all have finished or failed."""
         jobs = [WorkerJob(work, group, works) for work in works for group in work.groups]
         waiting = deque(jobs)
         outcome = EngineOutcome()

@@ -51,11 +51,6 @@ def find(
     ----------
     seeds, epochs:
         None takes those of the task's protocol.
-
-    Raises
-    ------
-    StoreError
-        If the entry's folder is damaged, or belongs to another entry.
     """
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
@@ -109,13 +104,6 @@ def run(
         As for `train`.
     quiet:
         Whether to show nothing.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C, when every worker has saved and ended.
-    QrlSuiteError
-        If the entry, the budget or the code cannot be used, or training failed; finished epochs are kept.
     """
     check_budget(budget, where)
     require_same_code(runs, [entry], where, quiet)
@@ -134,13 +122,6 @@ def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet:
 
     With `where.fresh`, such seeds are set aside, which is said unless `quiet`; with `where.same`, the codes are
     declared to be the same.
-
-    Raises
-    ------
-    StoreError
-        Saying what changed and the ways on, or why seeds cannot be set aside.
-    OptionError
-        If both ways are asked for, or the reason is none.
     """
     if where.fresh and where.same is not None:
         raise OptionError(
@@ -162,13 +143,7 @@ def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet:
 
 
 def require_trainable(entries: Sequence[Entry], where: Where) -> None:
-    """Refuse what cannot be trained together, before anything is trained or handed to a queue: wrong actions, say.
-
-    Raises
-    ------
-    QrlSuiteError
-        Saying what goes instead; not where the environment is lacking here, and other machines train.
-    """
+    """Refuse what cannot be trained together, before anything is trained or handed to a queue: wrong actions, say."""
     from qrlsuite.training import trainer  # imports torch
 
     for entry in {entry.population_key: entry for entry in entries}.values():
@@ -186,13 +161,7 @@ class _TimeIsUp(Exception):
 
 
 def check_budget(budget: str | None, where: Where) -> None:
-    """Refuse a budget that cannot be kept.
-
-    Raises
-    ------
-    OptionError
-        If it cannot be read, or the engine hands its work to a queue.
-    """
+    """Refuse a budget that cannot be kept."""
     if budget is None:
         return
     Budget.parse(budget)
@@ -218,13 +187,6 @@ def train(
         After which training stops, with every finished epoch saved. None for no limit.
     confirmed:
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C, when every worker has saved and ended.
-    QrlSuiteError
-        If a group failed; finished epochs are kept.
     """
     began, limit = time.monotonic(), seconds(budget, where.workers)
 
@@ -293,13 +255,7 @@ def expected(work: Missing, where: Where) -> str | None:
 
 
 def check_memory(work: Missing, where: Where) -> None:
-    """Refuse what does not fit into this machine's memory; a GPU's and a cluster's are not known.
-
-    Raises
-    ------
-    OptionError
-        Saying how many seeds would fit.
-    """
+    """Refuse what does not fit into this machine's memory; a GPU's and a cluster's are not known."""
     if where.device == "cpu" and not where.remote:
         groups = [group.seeds for group in work.groups]
         memory.require(work.entry, groups, where.workers, memory.available())
@@ -329,13 +285,7 @@ def summarize(work: Missing) -> dict[str, Any]:
 
 
 def _check_device(name: str) -> None:
-    """Look whether there is such a device; torch is imported for a GPU only.
-
-    Raises
-    ------
-    OptionError
-        If this machine or this build of torch has none.
-    """
+    """Look whether there is such a device; torch is imported for a GPU only."""
     if name != "cpu":
         devices.find(name)
 

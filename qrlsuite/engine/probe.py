@@ -129,11 +129,6 @@ def train(
     ----------
     start:
         The file of the agent with which all of them begin, where the entry begins with agents.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the entry cannot be built, or its training fails.
     """
     from qrlsuite.training.group import lines_of
     from qrlsuite.training.trainer import Trainer
@@ -156,15 +151,7 @@ class _ProbeFailed(Exception):
 def in_fresh_process(
     entry: Entry, seeds: Sequence[int], epochs: int, device: str, start: Path | None = None
 ) -> tuple[Side, float]:
-    """Do what `train` does in a process that has run nothing else; returns its processor time, too.
-
-    Raises
-    ------
-    PluginError
-        If the training fails there.
-    _ProbeFailed
-        If the process was killed, or cannot train for another reason: it finds no such device, say.
-    """
+    """Do what `train` does in a process that has run nothing else; returns its processor time, too."""
     task: dict[str, Any] = {
         "entry": entry.record(),
         "seeds": list(seeds),
@@ -285,11 +272,6 @@ def prepare(parts: Sequence[tuple[EntryStore, Sequence[int]]], epochs: int, devi
     ----------
     parts:
         The group's seeds, by the folder of their entry.
-
-    Raises
-    ------
-    StoreError
-        If the entry's folder cannot be written.
     """
     agents = [(store, seed) for store, seeds in parts for seed in seeds]
     store, seed = agents[len(agents) // 2]

@@ -85,15 +85,7 @@ def _expected(entry_hash: str, record: bytes) -> Expected:
 
 
 def seeds_per_task(entry: Entry) -> int:
-    """Return how many seeds of an entry fit into a task, at most.
-
-    Raises
-    ------
-    OptionError
-        If not even one does.
-    QrlSuiteError
-        If the entry cannot be built.
-    """
+    """Return how many seeds of an entry fit into a task, at most."""
     size = _expected(entry.hash, json_line(entry.record())).seed_bytes
     if size > MOST_BYTES - HEADER_BYTES:
         raise OptionError(f"'{entry.label}': {too_large(size, 1)}")
@@ -101,15 +93,7 @@ def seeds_per_task(entry: Entry) -> int:
 
 
 def train(engine: RemoteEngine, works: Sequence[Work], show: Show) -> EngineOutcome:
-    """Train groups of entries to their last epoch, one entry after the other.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C: what was accepted is saved; what workers had begun since is lost, a minute each at most.
-    QrlSuiteError
-        If nobody can be connected to, or the connection is lost.
-    """
+    """Train groups of entries to their last epoch, one entry after the other."""
     outcome = EngineOutcome()
     for work in works:
         run = _Run(engine, work, works)
@@ -194,13 +178,7 @@ class _Run:
             self.claims.close()
 
     def _probe(self, show: Show) -> None:
-        """Make the entry's probe here, where one is needed: both sides are trained in fresh processes.
-
-        Raises
-        ------
-        DependentSeedsError
-            If the seeds depend on each other; nothing has been sent then.
-        """
+        """Make the entry's probe here, where one is needed: both sides are trained in fresh processes."""
         probes.require_independent(self.store)
         first = self.members[0]
         probe = probing.prepare([(self.store, first.group.seeds)], self.work.epochs, self.work.device)
@@ -381,15 +359,7 @@ class _Claims(threading.Thread):
                 self._lost |= any(not claim.refresh() for claim in self._held.values())
 
     def require_held(self, seeds: tuple[int, ...]) -> None:
-        """Refuse a group that is somebody else's.
-
-        Raises
-        ------
-        SeedsClaimedError
-            Saying whose.
-        StoreError
-            If another process took seeds over.
-        """
+        """Refuse a group that is somebody else's."""
         if seeds in self._refused:
             raise self._refused[seeds]
         with self._lock:
@@ -404,13 +374,7 @@ class _Claims(threading.Thread):
                 claim.release()
 
     def require(self) -> None:
-        """Refuse to go on without a claim that was held.
-
-        Raises
-        ------
-        StoreError
-            If another process took seeds over.
-        """
+        """Refuse to go on without a claim that was held."""
         if self._lost:
             raise StoreError(
                 f"{self._store.path}: this process was not heard of for a while, and its seeds were taken over; "

@@ -52,15 +52,7 @@ class EntryStatus:
 
 
 def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
-    """Look at every entry of a results folder, or of one task in it; disturbs no worker.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such task.
-    StoreError
-        If there is no such folder.
-    """
+    """Look at every entry of a results folder, or of one task in it; disturbs no worker."""
     name = lookup.task_name(runs, task)
     statuses = []
     queues = Queues()
@@ -77,13 +69,7 @@ def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
 
 
 def choose(runs: Path, names: Sequence[str], task: str | None = None) -> list[EntrySurvey]:
-    """Look at the entries that names mean, each once.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such task, or none or several entries have a name.
-    """
+    """Look at the entries that names mean, each once."""
     task = lookup.task_name(runs, task)
     stored = lookup.stored(entries(runs, task))
     searched = f"{runs}, task {task}" if task else runs
@@ -93,13 +79,7 @@ def choose(runs: Path, names: Sequence[str], task: str | None = None) -> list[En
 
 
 def delete_each(runs: Path, chosen: Sequence[EntrySurvey]) -> int:
-    """Delete entries with all their seeds; returns the bytes that were freed.
-
-    Raises
-    ------
-    StoreError
-        If an entry is being trained, or waits in a queue.
-    """
+    """Delete entries with all their seeds; returns the bytes that were freed."""
     queues, freed = Queues(), 0
     for entry in chosen:
         store = EntryStore(entry.folder)

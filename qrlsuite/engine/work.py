@@ -126,13 +126,6 @@ class Engine(Protocol):
         """Train the groups, calling `show` with their progress now and then; or hand them over and return.
 
         Of all works together, as many groups at a time as `workers` of the first says. `job_name` names a group.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After Ctrl-C, when every worker has saved and ended.
-        QrlSuiteError
-            If nothing can be started.
         """
 
 
@@ -170,13 +163,7 @@ class Link(Protocol):
         """
 
     def receive(self, seconds: float) -> list[Answer]:
-        """Return the answers that have come, each once; waits for the first of them, that long at most.
-
-        Raises
-        ------
-        QrlSuiteError
-            If no further answer will come, as when the connection is lost.
-        """
+        """Return the answers that have come, each once; waits for the first of them, that long at most."""
 
     def close(self) -> None:
         """Forget the tasks that have no answer yet, and disconnect."""
@@ -204,11 +191,6 @@ class RemoteEngine(Engine, Protocol):
         versions:
             What a worker must have: versions of distributions, and of `python`. `work_on` refuses where they differ;
             a link that knows which worker has what sends it nothing.
-
-        Raises
-        ------
-        QrlSuiteError
-            If there is nobody to connect to.
         """
 
 
@@ -229,13 +211,7 @@ def worker_command(work: Work, group: SeedGroup) -> list[str]:
 
 
 def raise_failures(outcome: EngineOutcome) -> None:
-    """Turn failed groups into one error.
-
-    Raises
-    ------
-    QrlSuiteError
-        Naming every group that failed and why; groups that failed alike are named together.
-    """
+    """Turn failed groups into one error."""
     if outcome.failed:
         alike: dict[str, list[str]] = {}
         for name, message in sorted(outcome.failed.items()):

@@ -71,16 +71,6 @@ def train_group(
         The process without which this one shall not go on.
     others:
         Folders of further entries, of which the same seeds are trained in the same population.
-
-    Raises
-    ------
-    SeedsClaimedError
-        If another worker holds one of the seeds; entries of which nobody holds any are trained before.
-    QrlSuiteError
-        If the entry cannot be built, its environment fails, its seeds depend on each other, or results cannot be
-        written.
-    KeyboardInterrupt
-        After an interruption, with everything saved.
     """
     from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
 
@@ -154,13 +144,7 @@ def end_with(parent: int) -> bool:
 
 
 def checkpoint_seconds(default: float) -> float:
-    """Return the time between checkpoints that the environment asks for.
-
-    Raises
-    ------
-    StoreError
-        If it is not a number of seconds.
-    """
+    """Return the time between checkpoints that the environment asks for."""
     text = os.environ.get("QRLSUITE_CHECKPOINT_SECONDS")
     if text is None:
         return default

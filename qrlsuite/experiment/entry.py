@@ -198,11 +198,6 @@ def resolve(
     algorithm, settings, preset:
         What was given beside the text. A preset is one of the task's, or a file's path (anything that ends in `.toml`).
         A file's values come before those of the task's default preset; settings come before both.
-
-    Raises
-    ------
-    QrlSuiteError
-        For an unknown name or option, or a value that an option cannot have.
     """
     written = entry if isinstance(entry, Written) else notation.parse_entry(entry)
     written = written.given(algorithm, tuple(settings), preset)
@@ -379,13 +374,7 @@ def _hand_to_ansatz(
 
 
 def from_record(record: Mapping[str, Any], source: str) -> Entry:
-    """Build an entry from what `Entry.record` returned.
-
-    Raises
-    ------
-    StoreError
-        If the record is malformed or, after a change of code, stands for another entry than it did.
-    """
+    """Build an entry from what `Entry.record` returned."""
     try:
         identity = record["identity"]
         file = TaskFile.model_validate(record["task_file"])

@@ -540,15 +540,6 @@ def load(name: str) -> Task:
 
     `gym:Acrobot-v1` is a task with settings for a quick look at an environment that Gymnasium knows. So is the name of
     a registered environment without lanes of its own, where no task has that name.
-
-    Raises
-    ------
-    UnknownNameError
-        If no task has the name.
-    FileError
-        If the file cannot be read or is malformed.
-    OptionError
-        If Gymnasium knows no such environment, or the algorithms cannot act or observe in it.
     """
     if is_quick(name):
         from qrlsuite.gymlanes import quick_task

@@ -58,13 +58,7 @@ def gpu() -> str:
 
 
 def simulator() -> str:
-    """Compute <Z> after a rotation by 0 and by pi.
-
-    Raises
-    ------
-    ValueError
-        If the values are wrong.
-    """
+    """Compute <Z> after a rotation by 0 and by pi."""
     import numpy as np
 
     from qrlsuite.circuit import Circuit, expectations

@@ -49,11 +49,6 @@ def save(store: EntryStore, seeds: Sequence[int], epoch: int, arrays: Mapping[st
     ----------
     arrays:
         Everything by name, first axis = position in `seeds`.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be written; earlier checkpoints are then untouched.
     """
     for name, array in arrays.items():
         if array.ndim == 0 or array.shape[0] != len(seeds):
@@ -83,13 +78,7 @@ def _remove_superseded(store: EntryStore, newest: Header) -> None:
 
 
 def headers(store: EntryStore) -> list[Header]:
-    """Return what every group's checkpoint holds, without reading its tensors.
-
-    Raises
-    ------
-    StoreError
-        If a checkpoint is damaged or of another format version.
-    """
+    """Return what every group's checkpoint holds, without reading its tensors."""
     if not store.groups.is_dir():
         return []
     headers_found = []
@@ -134,11 +123,6 @@ def load(store: EntryStore, seeds: Sequence[int]) -> tuple[int, Arrays]:
     tuple
         The epoch, and every array with first axis = position in `seeds`; epoch 0 and no arrays where no seed
         has a checkpoint.
-
-    Raises
-    ------
-    StoreError
-        If the seeds are at different epochs, or a file is damaged.
     """
     newest = latest(store)
     epochs = {newest[seed].epoch if seed in newest else 0 for seed in seeds}

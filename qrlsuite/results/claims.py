@@ -224,15 +224,7 @@ def _refreshed(claim: Claim) -> int | None:
 
 
 def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
-    """Claim seeds for this process.
-
-    Raises
-    ------
-    SeedsClaimedError
-        If a living worker holds any of them; the message says who.
-    StoreError
-        If the folder cannot be written.
-    """
+    """Claim seeds for this process."""
     (claim,) = acquire_each(store, [seeds])
     if isinstance(claim, SeedsClaimedError):
         raise claim
@@ -246,11 +238,6 @@ def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Cla
     -------
     list
         For each group its claim, or the error that `acquire` raises where a living worker holds one of its seeds.
-
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written.
     """
     wanted = {seed for seeds in groups for seed in seeds}
     try:
@@ -296,15 +283,7 @@ def _acquire_free(
 
 
 def move_away(store: EntryStore, target: Path) -> None:
-    """Rename an entry's folder while nobody trains it; who comes for its seeds later finds no entry.
-
-    Raises
-    ------
-    SeedsClaimedError
-        If a living worker holds any of its seeds; the message says who.
-    StoreError
-        If the folder cannot be renamed.
-    """
+    """Rename an entry's folder while nobody trains it; who comes for its seeds later finds no entry."""
     try:
         store.claims.mkdir(exist_ok=True)
         with _locked(store.claims):

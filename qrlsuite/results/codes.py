@@ -63,13 +63,7 @@ class SameCode:
 
 
 def read(record: Mapping[str, Any], source: Path) -> CodeIdentity | None:
-    """Return the identity that a record has under `code`, None where it has none.
-
-    Raises
-    ------
-    StoreError
-        If it is not one.
-    """
+    """Return the identity that a record has under `code`, None where it has none."""
     content = record.get("code")
     if content is None:
         return None
@@ -112,11 +106,6 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
     """Return an entry's seeds by their code, those of one code first that the lowest seed has.
 
     A seed of which no epoch was finished is left out: any code may begin it anew.
-
-    Raises
-    ------
-    StoreError
-        If a seed's code is no identity, or the entry's record is damaged.
     """
     seeds: dict[str, list[int]] = {}
     codes: dict[str, CodeIdentity | None] = {}
@@ -145,13 +134,7 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
 
 
 def _declared(store: EntryStore) -> list[list[str]]:
-    """Return the digests that were declared to be the same, one list for each declaration.
-
-    Raises
-    ------
-    StoreError
-        If the entry's record is damaged.
-    """
+    """Return the digests that were declared to be the same, one list for each declaration."""
     said = store.record().get("same", [])
     if not isinstance(said, list) or not all(
         isinstance(one, dict)
@@ -177,13 +160,7 @@ def _alike(codes: Mapping[str, CodeIdentity | None], declared: Sequence[Sequence
 
 
 def others(store: EntryStore, current: CodeIdentity) -> list[SameCode]:
-    """Return the seeds of an entry that another code than this one has begun.
-
-    Raises
-    ------
-    StoreError
-        If a record is damaged.
-    """
+    """Return the seeds of an entry that another code than this one has begun."""
     held = of_seeds(store)
     if not held:
         return []
@@ -197,15 +174,7 @@ def others(store: EntryStore, current: CodeIdentity) -> list[SameCode]:
 
 
 def require(store: EntryStore, current: CodeIdentity) -> None:
-    """Refuse to continue an entry's seeds with another code than that which began them.
-
-    Raises
-    ------
-    ChangedCodeError
-        Saying what changed, and the ways on.
-    StoreError
-        If a record is damaged.
-    """
+    """Refuse to continue an entry's seeds with another code than that which began them."""
     for group in others(store, current):
         raise ChangedCodeError(_refusal(store, group, current))
 
@@ -237,15 +206,7 @@ def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
 
 
 def require_installed(store: EntryStore, seeds: Collection[int], current: CodeIdentity) -> None:
-    """Refuse to build trained agents with a plugin's code that has changed since; `numerics` do not count.
-
-    Raises
-    ------
-    ChangedCodeError
-        Saying what changed.
-    StoreError
-        If a record is damaged.
-    """
+    """Refuse to build trained agents with a plugin's code that has changed since; `numerics` do not count."""
     for group in others(store, current):
         for code in filter(None, group.codes.values() if set(group.seeds) & set(seeds) else ()):
             changed = identity.differences(code.parts, current.parts, numerics=False)
@@ -266,13 +227,6 @@ def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> 
         Where the seeds are to go; it need not exist.
     exported:
         Whether `source` is an exported entry, whose record has its code.
-
-    Raises
-    ------
-    ChangedCodeError
-        Saying what differs.
-    StoreError
-        If a record is damaged.
     """
     groups = of_seeds(store)
     own = {digest: code for group in groups for digest, code in group.codes.items()}
@@ -296,13 +250,7 @@ def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> 
 
 
 def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
-    """Refuse to train an entry here with another code than that of whoever started it.
-
-    Raises
-    ------
-    StoreError
-        Naming this machine and what differs.
-    """
+    """Refuse to train an entry here with another code than that of whoever started it."""
     path = store.path / "entry.json"
     sent = read(store.record(), path) if path.exists() else None
     if sent is None:
@@ -322,11 +270,6 @@ def prepare(store: EntryStore, current: CodeIdentity, plugins: Sequence[own.Sour
     ----------
     plugins:
         The plugins by path among that code. They are copied into the entry's folder, where workers find them.
-
-    Raises
-    ------
-    StoreError
-        If a file cannot be written.
     """
     record = store.record()
     kept = {code: list(places) for code, places in _kept(store, record).items() if code != current.digest}
@@ -346,13 +289,7 @@ _COPY = re.compile(rf"{PLUGINS}/([0-9a-f]{{16}})/[A-Za-z_][A-Za-z0-9_]*(\.py)?")
 
 
 def _kept(store: EntryStore, record: Mapping[str, Any]) -> Mapping[str, list[str]]:
-    """Return where an entry's copies of plugins are, by the digest of the code that they belong to.
-
-    Raises
-    ------
-    StoreError
-        If the record says something else than that.
-    """
+    """Return where an entry's copies of plugins are, by the digest of the code that they belong to."""
     kept = record.get("plugins", {})
     if not isinstance(kept, dict) or not all(
         isinstance(places, list) and all(isinstance(each, str) and _COPY.fullmatch(each) for each in places)
@@ -398,13 +335,7 @@ def _copied(store: EntryStore, plugin: own.Source) -> str:
 
 
 def copies(store: EntryStore) -> list[Path]:
-    """Return the copies of plugins by path with which an entry is trained now; imports nothing.
-
-    Raises
-    ------
-    StoreError
-        If the entry's record is damaged.
-    """
+    """Return the copies of plugins by path with which an entry is trained now; imports nothing."""
     record = store.record()
     code = read(record, store.path / "entry.json")
     places = [] if code is None else _kept(store, record).get(code.digest, [])
@@ -418,13 +349,6 @@ def load_plugins(path: str | os.PathLike[str]) -> list[own.Loaded]:
     """Load a plugin's file or folder; of an entry's folder, the copies with which the entry is trained.
 
     Nothing else imports what lies in a results folder: to read an entry never does.
-
-    Raises
-    ------
-    PluginError
-        See `qrlsuite.own.load`; or if the entry has no copies.
-    StoreError
-        If a copy is not what it was when it was made.
     """
     store = EntryStore(Path(path))
     if not (store.path / "entry.json").is_file():
@@ -438,15 +362,7 @@ def load_plugins(path: str | os.PathLike[str]) -> list[own.Loaded]:
 
 
 def load_copies(store: EntryStore) -> list[own.Loaded]:
-    """Load the copies of plugins by path with which an entry is trained.
-
-    Raises
-    ------
-    PluginError
-        If one cannot be loaded.
-    StoreError
-        If a copy is not what it was when it was made.
-    """
+    """Load the copies of plugins by path with which an entry is trained."""
     sources = [own.read(path) for path in copies(store)]
     for source in sources:
         if source.mark != source.path.parent.name:
@@ -458,15 +374,7 @@ def load_copies(store: EntryStore) -> list[own.Loaded]:
 
 
 def declare_same(store: EntryStore, current: CodeIdentity, reason: str) -> None:
-    """Record its author's word that an entry's seeds of another code and this code do the same.
-
-    Raises
-    ------
-    OptionError
-        If no reason is given.
-    StoreError
-        If a record is damaged or cannot be written.
-    """
+    """Record its author's word that an entry's seeds of another code and this code do the same."""
     if not reason.strip() or not reason.isprintable():
         raise OptionError(
             "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
@@ -503,12 +411,6 @@ def set_aside(
     -------
     tuple
         Where the old seeds are now, and where this code's seeds were; None where there are none.
-
-    Raises
-    ------
-    StoreError
-        If somebody trains the entry, a queue or a study with looks has it, seeds of both codes are in it, its new place
-        is taken, or it cannot be moved.
     """
     changed = others(store, current)
     if not changed:

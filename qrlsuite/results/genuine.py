@@ -24,13 +24,7 @@ _CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066
 
 
 def require_no_link(*paths: Path) -> None:
-    """Refuse links below a results folder; the results folder itself may be one.
-
-    Raises
-    ------
-    StoreError
-        Naming the link.
-    """
+    """Refuse links below a results folder; the results folder itself may be one."""
     for path in paths:
         if path.is_symlink():
             raise StoreError(
@@ -40,13 +34,7 @@ def require_no_link(*paths: Path) -> None:
 
 
 def require_plain(path: Path | str, content: object) -> None:
-    """Refuse content, as of a file, if a text in it could control the terminal that shows it.
-
-    Raises
-    ------
-    StoreError
-        Showing the text.
-    """
+    """Refuse content, as of a file, if a text in it could control the terminal that shows it."""
     left = [content]
     while left:
         value = left.pop()
@@ -61,13 +49,7 @@ def require_plain(path: Path | str, content: object) -> None:
 
 
 def require_entry(record: Mapping[str, Any]) -> None:
-    """Refuse an entry's record whose hashes and name do not stand for what it says was run.
-
-    Raises
-    ------
-    ValueError
-        Saying what is wrong.
-    """
+    """Refuse an entry's record whose hashes and name do not stand for what it says was run."""
     identity = record["identity"]
     if not isinstance(identity.get("task"), dict):
         raise ValueError("the task is not a table")
@@ -90,11 +72,6 @@ def require_seed(folder: Path, seed: int, record: Mapping[str, Any], names: Mapp
     ----------
     names:
         `entry`, `task` and `task_hash` of the entry that the folder lies in; empty where its own record is damaged.
-
-    Raises
-    ------
-    StoreError
-        Saying what the record names.
     """
     for name, expected in {"seed": seed, **names}.items():
         if record.get(name) != expected:

@@ -79,13 +79,6 @@ def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> l
     ----------
     also:
         Further folders of results.
-
-    Raises
-    ------
-    UnknownNameError
-        If a name is neither registered nor has a folder of results: with the nearest one, or the file that has it.
-    FileError
-        If a task file cannot be read or is malformed.
     """
     folders = [folder for folder in (runs, *also) if folder.is_dir()]
     held = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
@@ -121,11 +114,6 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
     ----------
     searched:
         For the message: the folder that was looked into.
-
-    Raises
-    ------
-    UnknownNameError
-        If none or several match; the message says what to type.
     """
     found = fitting(among, name)
     if not found:

@@ -45,11 +45,6 @@ def read(path: Path, values: int = MOST_VALUES) -> pyarrow.Table:
     ----------
     values:
         How many it may hold at most, over all columns; a list counts as its members.
-
-    Raises
-    ------
-    StoreError
-        If it is damaged, or decodes to more than that or than `MOST_BYTES`.
     """
     try:
         size = path.stat().st_size

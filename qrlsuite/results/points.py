@@ -69,13 +69,7 @@ class _Rows:
         self._count = 0
 
     def add(self, entry: str, seed: int, step: int, score: float, source: str) -> None:
-        """Add a point.
-
-        Raises
-        ------
-        FileError
-            If it is none: a score that is not finite, a name or seed that none can have. Or there are too many.
-        """
+        """Add a point."""
         if not math.isfinite(score):
             raise FileError(
                 f"{source}: the score of '{ascii(entry)[1:-1]}', seed {seed}, at step {step} is {score}: every score "
@@ -92,13 +86,7 @@ class _Rows:
         scores.append(score)
 
     def points(self) -> dict[Run, Points]:
-        """Return the points of every run; one at step 0, before training, is left out.
-
-        Raises
-        ------
-        FileError
-            If steps do not increase, or there is no point.
-        """
+        """Return the points of every run; one at step 0, before training, is left out."""
         found = {}
         for (entry, seed), (steps, scores, source) in self._runs.items():
             at, values = np.array(steps, np.int64), np.array(scores, np.float64)
@@ -151,11 +139,6 @@ def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Po
     -------
     dict
         The points of each run.
-
-    Raises
-    ------
-    FileError
-        If a file cannot be read, is of no known kind, or holds what is no learning curve.
     """
     rows, of_runs = _Rows(), list[Path]()
     for path in dict.fromkeys(paths):
@@ -189,13 +172,6 @@ def read_table(table: Any, metric: str | None = None) -> dict[Run, Points]:
         What `pyarrow.table` takes: a table, a data frame of pandas or polars.
     metric:
         The column that is the score.
-
-    Raises
-    ------
-    OptionError
-        If it is no table.
-    FileError
-        As for `read_files`.
     """
     try:
         arrow = table if isinstance(table, pyarrow.Table) else pyarrow.table(table)
@@ -219,13 +195,6 @@ def read_arrays(curves: Mapping[str, tuple[Iterable[int], ArrayLike]], steps: Ar
     ----------
     steps:
         (K,) environment steps of the scores.
-
-    Raises
-    ------
-    OptionError
-        If shapes do not fit.
-    FileError
-        As for `read_files`.
     """
     at, rows = np.asarray(steps), _Rows()
     if at.ndim != 1 or at.dtype.kind not in "iu":
@@ -251,13 +220,7 @@ def read_arrays(curves: Mapping[str, tuple[Iterable[int], ArrayLike]], steps: Ar
 
 
 def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str, ...]:
-    """Return the names of the four columns.
-
-    Raises
-    ------
-    FileError
-        If one is missing, or there twice.
-    """
+    """Return the names of the four columns."""
     have = [name.lower() for name in names]
     found, wrong, several = list[str](), list[str](), list[str]()
     for column in COLUMNS:
@@ -282,13 +245,7 @@ def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str
 
 
 def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str) -> None:
-    """Add a row of four values.
-
-    Raises
-    ------
-    FileError
-        If one is missing or no number.
-    """
+    """Add a row of four values."""
     for name, value in zip(COLUMNS, values):
         if value is None or value == "":
             raise FileError(
@@ -310,13 +267,7 @@ _BEFORE = re.compile(r"[-_ =.]*(seed|run)?[-_ =.]*$", re.IGNORECASE)
 
 
 def _named(paths: Sequence[Path]) -> dict[Run, list[Path]]:
-    """Return files by the run that they are of.
-
-    Raises
-    ------
-    FileError
-        If a run's name has no number, or two runs have one name.
-    """
+    """Return files by the run that they are of."""
     of_folders: dict[tuple[str, ...], list[Path]] = defaultdict(list)
     for path in paths:
         of_folders[run_files.words(path)].append(path)

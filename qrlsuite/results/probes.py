@@ -53,13 +53,7 @@ def third_party(made_with: Mapping[str, Any]) -> bool:
 
 
 def require_independent(store: EntryStore) -> None:
-    """Refuse to go on with an entry of which a probe has found that its seeds depend on each other.
-
-    Raises
-    ------
-    DependentSeedsError
-        Saying what differs, the likely causes, and what to type.
-    """
+    """Refuse to go on with an entry of which a probe has found that its seeds depend on each other."""
     for probe in of_entry(store):
         if probe["result"] == DIFFERS:
             raise refusal(store, probe)

@@ -69,13 +69,7 @@ def below(folder: Path) -> str:
 
 
 def holds_one_run(path: Path) -> bool:
-    """Return whether a file holds one run; a csv file may hold many.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read, is too large, or is of no known kind.
-    """
+    """Return whether a file holds one run; a csv file may hold many."""
     try:
         if path.is_dir():
             raise FileError(
@@ -119,11 +113,6 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
     ----------
     metric:
         The scalar of TensorBoard, W&B or progress.csv that is the score.
-
-    Raises
-    ------
-    FileError
-        If one is damaged, of another kind than the others, or does not hold a learning curve.
     """
     kinds = {_kind(path) for path in paths}
     reader = _kind(paths[0])
@@ -155,13 +144,7 @@ def _streamed(path: Path) -> bool:
 
 
 def whole(value: Any) -> int:
-    """Return a whole number, also of text such as 1000 or 1000.0.
-
-    Raises
-    ------
-    ValueError
-        If it is none, or larger than a number of steps can be.
-    """
+    """Return a whole number, also of text such as 1000 or 1000.0."""
     number = value if isinstance(value, int) and not isinstance(value, bool) else float(value)
     if not math.isfinite(number) or number != int(number) or abs(number) >= 2**53:
         raise ValueError(f"{value!r} is not a whole number")
@@ -169,13 +152,7 @@ def whole(value: Any) -> int:
 
 
 def lines_of(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read, is no text, or has a line that no csv file has.
-    """
+    """Yield the lines of a text file."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             while line := file.readline(_LONGEST_LINE):
@@ -272,13 +249,7 @@ def _evaluations(paths: Sequence[Path], metric: str | None) -> Curve:
 
 
 def _npz_array(path: Path, name: str) -> NDArray[Any]:
-    """Return an array of an npz file; its size is known before it is unpacked.
-
-    Raises
-    ------
-    FileError
-        If it is not there, is damaged or too large, or holds Python objects.
-    """
+    """Return an array of an npz file; its size is known before it is unpacked."""
     try:
         with zipfile.ZipFile(path) as archive:
             here = archive.namelist()
@@ -367,13 +338,7 @@ def _words_of_wandb(path: Path) -> tuple[str, ...]:
 
 
 def _wandb_records(path: Path) -> Iterator[Mapping[str, Any]]:
-    """Yield the records of a file, as W&B's own program prints them.
-
-    Raises
-    ------
-    FileError
-        If W&B is not installed, or a record is no JSON or too long.
-    """
+    """Yield the records of a file, as W&B's own program prints them."""
     _require_installed("wandb", path)
     command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", str(path.absolute())]
     env = {**os.environ, "WANDB_ERROR_REPORTING": "false", "WANDB_MODE": "offline"}

@@ -33,13 +33,7 @@ class SeedGroup:
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Parse `100` (seeds 0..99), `0:20`, or a list such as `0,3,10:12`.
-
-    Raises
-    ------
-    OptionError
-        If the text is none of these, or names no seed, or one twice.
-    """
+    """Parse `100` (seeds 0..99), `0:20`, or a list such as `0,3,10:12`."""
     seeds: list[int] = []
     for piece in (f"0:{text}" if text.isdecimal() else text).split(","):
         first, colon, last = piece.strip().partition(":")
@@ -56,13 +50,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def read_seeds(requested: int | str | Iterable[int]) -> list[int]:
-    """Return the seeds that are meant by a number (100: seeds 0 to 99), text as in `parse_seeds`, or the seeds.
-
-    Raises
-    ------
-    OptionError
-        If it is none of these, names no seed, one twice, or a negative one.
-    """
+    """Return the seeds that are meant by a number (100: seeds 0 to 99), text as in `parse_seeds`, or the seeds."""
     if isinstance(requested, str):
         return parse_seeds(requested)
     if _is_seed(requested):

@@ -57,13 +57,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content, or leave it as it is.
-
-    Raises
-    ------
-    StoreError
-        If the disk is full or the folder cannot be written.
-    """
+    """Replace a file by new content, or leave it as it is."""
     try:
         with contextlib.suppress(FileExistsError):  # a file in the folder's place is named by the next line
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,13 +90,7 @@ def _umask() -> int:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object with a format version.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be read, is not an object, has another format version, or holds text that controls a terminal.
-    """
+    """Read a JSON object with a format version."""
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -131,13 +119,7 @@ def json_line(record: Mapping[str, Any]) -> bytes:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Read JSON lines; a torn last line (a writer was killed) is dropped.
-
-    Raises
-    ------
-    StoreError
-        If any other line is malformed; the message names it.
-    """
+    """Read JSON lines; a torn last line (a writer was killed) is dropped."""
     try:
         pieces = path.read_bytes().split(b"\n")
     except FileNotFoundError:
@@ -165,13 +147,6 @@ def read_arrays(path: Path, most: int = MOST_AGENT_BYTES) -> Arrays:
     ----------
     most:
         Bytes of a file that is read; the format packs nothing, so arrays are no larger.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is none.
-    StoreError
-        If it is larger, or damaged.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -191,13 +166,7 @@ def read_arrays(path: Path, most: int = MOST_AGENT_BYTES) -> Arrays:
 
 
 def require_finite(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
-    """Refuse parameters that are not numbers.
-
-    Raises
-    ------
-    StoreError
-        Naming the first.
-    """
+    """Refuse parameters that are not numbers."""
     for name, values in arrays.items():
         if not np.isfinite(values).all():
             raise StoreError(
@@ -215,13 +184,7 @@ def drop_torn_line(path: Path) -> None:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Append whole lines.
-
-    Raises
-    ------
-    StoreError
-        If the disk is full or the file cannot be written.
-    """
+    """Append whole lines."""
     try:
         with path.open("ab") as file:
             file.write(content)
@@ -311,13 +274,7 @@ class SeedStore:
         self.agent = path / "final.safetensors"
 
     def record(self) -> dict[str, Any] | None:
-        """Return `run.json`, or None where the run never began.
-
-        Raises
-        ------
-        StoreError
-            If it is damaged, names another seed, entry or task than the folder, or is reached by a link.
-        """
+        """Return `run.json`, or None where the run never began."""
         path = self.path / "run.json"
         genuine.require_no_link(self.path, path, self.lines, self.table, self.timings, self.agent)
         if not path.exists():
@@ -342,13 +299,7 @@ class SeedStore:
         write_json(self.path / "run.json", content)
 
     def parameters(self) -> Arrays:
-        """Return the trained agent's parameters by name.
-
-        Raises
-        ------
-        StoreError
-            If there are none, the file is damaged, or one is not a finite number though the run did not diverge.
-        """
+        """Return the trained agent's parameters by name."""
         try:
             arrays = read_arrays(self.agent)
         except FileNotFoundError:
@@ -368,11 +319,6 @@ class SeedStore:
         decimals:
             Whether scores are the shortest decimals, as in the lines; else those of the table are the float32 as they
             are, which saves most of the time.
-
-        Raises
-        ------
-        StoreError
-            If a file is damaged or an epoch is missing.
         """
         rows = read_table(self.table, decimals) if self.table.exists() else []
         last = _epoch(rows[-1], self.table) if rows else 0
@@ -432,11 +378,6 @@ class SeedStore:
 
         Processor time where it was recorded (training on the CPU), which other work on the same cores does not
         stretch; otherwise the time by the clock.
-
-        Raises
-        ------
-        StoreError
-            If a line of the timings is damaged.
         """
         return self._timed()[0]
 
@@ -453,13 +394,7 @@ class SeedStore:
         return total, clocked
 
     def read(self) -> SeedRun:
-        """Return what the run holds so far.
-
-        Raises
-        ------
-        StoreError
-            If a file is damaged, or scores are missing, not finite, or differ in number between epochs.
-        """
+        """Return what the run holds so far."""
         rows = self.epochs(decimals=False)
         try:
             with np.errstate(over="ignore"):
@@ -588,11 +523,6 @@ def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     ----------
     decimals:
         See `SeedStore.epochs`.
-
-    Raises
-    ------
-    StoreError
-        If the file is truncated, not parquet, or decodes to more than a run can hold.
     """
     table = parquet.read(path)
     try:
@@ -656,11 +586,6 @@ class EntryStore:
         ----------
         mark:
             That of seeds of another code, which stand beside the entry's own.
-
-        Raises
-        ------
-        StoreError
-            If a folder of another format version or another entry is in its place, or a link.
         """
         store = cls(runs / entry.task.name / f"{entry.name}{mark}")
         genuine.require_no_link(store.path.parent, store.path)
@@ -675,11 +600,6 @@ class EntryStore:
         Where the entry's settings are known to come from tuning, its record says so from now on; of two records
         of tuning the one that took more steps stands; one that does not know its steps gives way to one that does.
         `mark` is as for `find`.
-
-        Raises
-        ------
-        StoreError
-            If a folder of another format version or another entry is in its place, or it cannot be made.
         """
         store = cls.find(runs, entry, mark)
         path = store.path / "entry.json"
@@ -694,13 +614,7 @@ class EntryStore:
         return store
 
     def record(self) -> dict[str, Any]:
-        """Return `entry.json`.
-
-        Raises
-        ------
-        StoreError
-            If it is damaged, its hashes and name are not those of what it says was run, or it is reached by a link.
-        """
+        """Return `entry.json`."""
         path = self.path / "entry.json"
         genuine.require_no_link(self.path.parent, self.path, path)
         record = read_json(path)
@@ -738,13 +652,7 @@ class EntryStore:
         }
 
     def entry(self) -> Entry:
-        """Build the entry that the folder belongs to.
-
-        Raises
-        ------
-        StoreError
-            If its record is damaged, means something else by now, or it was imported.
-        """
+        """Build the entry that the folder belongs to."""
         if self.record().get("imported"):
             raise StoreError(
                 f"{self.path} holds curves that another program made: they can be compared, not trained, evaluated or "
@@ -773,13 +681,7 @@ class EntryStore:
         return self.start / f"seed-{seed:04d}.safetensors"
 
     def initial(self, seeds: Sequence[int]) -> Arrays:
-        """Return the agents with which the training of seeds begins, seed-first by name.
-
-        Raises
-        ------
-        StoreError
-            If one is not there, or damaged.
-        """
+        """Return the agents with which the training of seeds begins, seed-first by name."""
         agents = []
         for seed in seeds:
             path = self.start_of(seed)
@@ -839,13 +741,7 @@ ANOTHER_FOLDER = "`qrlsuite run` makes one, --runs DIR (in Python runs=DIR) name
 
 
 def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
-    """Return every entry's folder below a results folder, sorted by path.
-
-    Raises
-    ------
-    StoreError
-        If there is no such folder.
-    """
+    """Return every entry's folder below a results folder, sorted by path."""
     if not runs.is_dir():
         raise StoreError(f"there is no results folder {runs}: {ANOTHER_FOLDER}")
     pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"

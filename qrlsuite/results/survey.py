@@ -53,13 +53,7 @@ class EntrySurvey:
 
 
 def survey(runs: Path, task: str | None = None) -> list[EntrySurvey]:
-    """Look at every entry below a results folder; damage is reported per entry, never raised.
-
-    Raises
-    ------
-    StoreError
-        If there is no such folder.
-    """
+    """Look at every entry below a results folder; damage is reported per entry, never raised."""
     return [look(store) for store in entries(runs, task)]
 
 
@@ -93,13 +87,7 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
 
 
 def outline(store: EntryStore) -> dict[str, Any]:
-    """Return an entry's options and the distinct provenances of its seeds, as plain values.
-
-    Raises
-    ------
-    StoreError
-        If a record is damaged.
-    """
+    """Return an entry's options and the distinct provenances of its seeds, as plain values."""
     record = store.record()
     seeds = store.seeds()
     records = [store.seed(seed).record() or {} for seed in seeds]
@@ -165,13 +153,7 @@ def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
 
 
 def submitted(store: EntryStore) -> list[dict[str, Any]]:
-    """Return what `waiting` returns.
-
-    Raises
-    ------
-    StoreError
-        If `submitted.json` is damaged.
-    """
+    """Return what `waiting` returns."""
     problems: list[str] = []
     tasks = waiting(store, problems)
     if problems:
@@ -344,13 +326,7 @@ def garbage(runs: Path, task: str | None = None) -> tuple[list[Garbage], list[st
 
 
 def remove(items: Sequence[Garbage]) -> int:
-    """Remove what `garbage` found, unless somebody began to extend it meanwhile; returns the bytes freed.
-
-    Raises
-    ------
-    StoreError
-        If a folder cannot be removed.
-    """
+    """Remove what `garbage` found, unless somebody began to extend it meanwhile; returns the bytes freed."""
     freed = 0
     for item in items:
         try:
@@ -376,12 +352,6 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
         The results folder. What links out of it is not touched.
     queued:
         As for `look`.
-
-    Raises
-    ------
-    StoreError
-        If somebody trains the entry or a queue has some of its seeds, if its folder is a link or lies beyond one, or
-        if it cannot be removed.
     """
     require_movable(runs, store, queued)
     path = store.path
@@ -403,11 +373,6 @@ def require_movable(runs: Path, store: EntryStore, queued: Collection[int] | Non
     ----------
     runs, queued:
         As for `delete`.
-
-    Raises
-    ------
-    StoreError
-        Saying which of these.
     """
     path = store.path
     if path.is_symlink() or path.parent.is_symlink() or path.resolve().parents[1] != runs.resolve():

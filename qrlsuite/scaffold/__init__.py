@@ -139,13 +139,6 @@ def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) ->
     scores:
         For a kind with a task: the scores of random actions and of the best policy known, between which its
         thresholds are spread. Numbers outside [0, 1] are returns. Default: those of the template's environment.
-
-    Raises
-    ------
-    OptionError
-        If the kind has no task, or the scores are no range.
-    ScaffoldError
-        If a package cannot have the name, or something is installed or registered under it.
     """
     kinds: tuple[type[specs.Spec], ...] = (
         specs.kind(kind),
@@ -286,13 +279,7 @@ def compatible_versions() -> str:
 
 
 def write(package: Package, out: Path) -> Path:
-    """Write a package below a folder; returns the package's folder.
-
-    Raises
-    ------
-    ScaffoldError
-        If the package's folder exists already, or cannot be written. Nothing is changed then.
-    """
+    """Write a package below a folder; returns the package's folder."""
     folder = out / package.name
     if folder.exists() or folder.is_symlink():
         raise ScaffoldError(f"{folder} exists already and is left unchanged: choose another name or --out")

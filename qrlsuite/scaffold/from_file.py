@@ -46,14 +46,6 @@ def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
     ----------
     name:
         Of the distribution; None takes that of the file or folder.
-
-    Raises
-    ------
-    PluginError
-        If there is no such plugin, or it cannot be loaded.
-    ScaffoldError
-        If a package cannot have the name, something is installed or registered under it, or the signature of a short
-        form is not in the file itself.
     """
     made = own.load(path)
     kept = made.registered

@@ -125,11 +125,6 @@ class StudyWithLooks:
         For each pair the question that it answers; empty where the study asks none.
     folder:
         Where its results are, or will be.
-
-    Raises
-    ------
-    QrlSuiteError
-        If a name, an option or a number cannot be used, or an entry is no longer the one that was fixed.
     """
 
     def __init__(self, study: Study, runs: Path) -> None:
@@ -206,13 +201,7 @@ class StudyWithLooks:
         return any(self.folder.glob("*/*/seed-*"))
 
     def check(self) -> bool:
-        """Refuse a study that was changed after it began, or whose seeds were trained before; returns whether it began.
-
-        Raises
-        ------
-        OptionError
-            Saying what was changed, or which seeds were trained.
-        """
+        """Refuse a study that changed after it began, or whose seeds were trained before; return whether it began."""
         if not self.begun:
             for table, (name, entry) in zip(self.file.entries, self.entries.items()):
                 if table.code not in (None, code_of(entry)):
@@ -256,13 +245,7 @@ class StudyWithLooks:
         return self.looks.first_seed + max(1000, len(self.looks.block))
 
     def begin(self) -> None:
-        """Keep the study as it is now, before its first seed.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `check`; or if it was ended, or the folder cannot be written.
-        """
+        """Keep the study as it is now, before its first seed."""
         begun = self.check()
         if begun:
             self._require_code_of_new_entries()
@@ -292,13 +275,7 @@ class StudyWithLooks:
         )
 
     def end(self) -> None:
-        """Close the study for good, with its open pairs open.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `read`; or if it has not begun, was ended before, or has nothing open.
-        """
+        """Close the study for good, with its open pairs open."""
         state = self.read()
         if not state.begun:
             raise OptionError(f"{self.source}: the study has not begun, so there is nothing to end")
@@ -321,14 +298,7 @@ class StudyWithLooks:
                 yield Run(seed, record or {}, None, folder.seconds() / 3600)
 
     def read(self) -> StudyState:
-        """Read the folder once, and decide by it; writes nothing.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `check`; if a seed was not trained by this study; or if a look finds something else than it did when it
-            was taken.
-        """
+        """Read the folder once, and decide by it; writes nothing."""
         begun, log = self.check(), read_lines(self.folder / LOG)
         seeds, curves, hours = dict[str, list[int]](), dict[str, LearningCurves](), dict[str, float]()
         for name, entry in self.entries.items():
@@ -376,13 +346,7 @@ class StudyWithLooks:
                         )
 
     def look(self) -> StudyState:
-        """Take every look for which the seeds are there, and note when.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `read`, or if the log cannot be written.
-        """
+        """Take every look for which the seeds are there, and note when."""
         state = self.read()
         new = {
             line["look"]: line
@@ -417,12 +381,6 @@ def new(
         None for the first block from 10,000 of which no seed was trained below `runs`.
     looks:
         What else `LooksSection` has; None takes the default.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there are fewer than two entries, they would end at different horizons, or a name, an option or a number
-        cannot be used.
     """
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     looks |= {"written": now, "first_seed": first_seed}
@@ -477,14 +435,7 @@ def _brief(names: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:
-    """Return a study with every entry by itself, its hash, and all that is compared written out; and its entries.
-
-    Raises
-    ------
-    QrlSuiteError
-        If an entry is not the one that was fixed, there are fewer than two, two are the same, or they have no common
-        task or horizon.
-    """
+    """Return a study with every entry by itself, its hash, and all that is compared written out; and its entries."""
     members, source = study.members(), study.source
     if len(members) < 2:
         labels = [member.table.name or member.entry.label for member in members]

@@ -203,11 +203,6 @@ def select(
         As for `Study.members`; every model that takes the place of another has to be registered.
     only:
         Words, of which an entry's group, label or task has one; or names of entries. Empty takes all.
-
-    Raises
-    ------
-    QrlSuiteError
-        For an unknown name or option, or where no entry is left.
     """
     for new in (models or {}).values():
         registry.get(specs.ModelSpec, new)
@@ -239,11 +234,6 @@ def find_pending(
     ----------
     seeds, epochs:
         None takes those of each task's protocol.
-
-    Raises
-    ------
-    StoreError
-        If an entry's folder is damaged.
     """
     groups: dict[tuple[str, str], list[str]] = {}
     for member in members:
@@ -313,13 +303,7 @@ def dry_run(items: Sequence[PendingEntry], budget: float | None, workers: int) -
 
 
 def check_budget(items: Sequence[PendingEntry], budget: float, workers: int) -> None:
-    """Refuse a budget into which not even one seed of the cheapest entry fits.
-
-    Raises
-    ------
-    OptionError
-        Saying what the smallest piece of work would need.
-    """
+    """Refuse a budget into which not even one seed of the cheapest entry fits."""
     order = cheapest_first(items)
     if not order or any(fitting(item, budget, workers) for item in order):
         return
@@ -357,13 +341,6 @@ class Session:
         """Train what is missing, cheapest first; returns the items that did not fit into the budget.
 
         The budget counts from the first call: that of several studies is one.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After Ctrl-C, with everything saved.
-        QrlSuiteError
-            If a group failed; finished epochs are kept.
         """
         if self._began is None:
             self._began = self.clock()
@@ -420,13 +397,6 @@ def take_looks(study: StudyWithLooks, session: Session) -> StudyOutcome:
     ----------
     session:
         In the study's folder. Unless it is quiet, it says what every look decides.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C, with everything saved.
-    QrlSuiteError
-        If the study cannot be used or go on, or training failed; finished epochs are kept.
     """
     require_same_code(study.folder, list(study.entries.values()), session.where, session.quiet)
     study.begin()

@@ -26,11 +26,6 @@ def nearest_size(make: Callable[[int], Entry], target: Entry) -> int:
         Builds the entry of a size 1, 2, ...; its parameter count grows with the size.
     target:
         The entry to be matched. Where two sizes are equally near, the smaller is taken.
-
-    Raises
-    ------
-    OptionError
-        If no size up to 4096 is large enough.
     """
     target_size = parameters(target)
     low, high = 1, 1

@@ -245,11 +245,6 @@ class Study:
             Options that replace the study's own, in every entry that has them.
         models:
             Models to be used in the place of others, by name.
-
-        Raises
-        ------
-        QrlSuiteError
-            For an unknown name or option, or a value that an option cannot have; the message names the study.
         """
         models = models or {}
         named: set[str] = set()

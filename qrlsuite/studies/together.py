@@ -60,11 +60,6 @@ class StudiesTogether(Shown):
     """Several studies with looks, each of a task of its own, which compare entries of the same names.
 
     Entries of one name may have other options on another task: those that were tuned for it, for example.
-
-    Raises
-    ------
-    OptionError
-        If there are fewer than two studies, two of one task, one without its first look, or no pair that all have.
     """
 
     studies: tuple[StudyOutcome, ...]

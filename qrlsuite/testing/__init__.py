@@ -41,11 +41,6 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
     more:
         Of an environment: `deterministic=True` where all its episodes are meant to be alike. Of an algorithm or model:
         `task`, a task or its file, whose environment is taken in place of the toys.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there is no such kind or name.
     """
     import importlib
 
@@ -64,13 +59,7 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
 
 
 def assert_conforms(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) -> None:
-    """Fail with every broken rule and its likely cause; the arguments are those of `check`.
-
-    Raises
-    ------
-    AssertionError
-        If a rule does not hold.
-    """
+    """Fail with every broken rule and its likely cause; the arguments are those of `check`."""
     broken = [finding for finding in check(kind, name_or_spec, settings, **more) if not finding.ok]
     if broken:
         lines = [f"  {finding.rule}: {finding.message}" for finding in broken]

@@ -99,11 +99,6 @@ def subject(
     settings:
         Values of options. Where there are options `qubits` and `layers` and they are not set, two qubits and one
         layer are taken: conformance shows at the smallest size, and simulators take long at others.
-
-    Raises
-    ------
-    UnknownNameError, PluginError
-        If nothing or more than one thing has that name.
     """
     known = registry.load()
     if kind is specs.TaskSpec and isinstance(name_or_spec, str) and name_or_spec.endswith(".toml"):

@@ -107,11 +107,6 @@ def built_in_order(subject: Any, shape: Sequence[int], outputs: int) -> dict[int
     -------
     dict
         By seed, digests of its parameters and buffers where it was built first and second.
-
-    Raises
-    ------
-    BrokenRuleError
-        If an interpreter ends without an answer.
     """
     common = [subject.spec.build, subject.spec.options, dict(subject.settings), [*shape], outputs]
     processes = [

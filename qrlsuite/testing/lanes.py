@@ -35,13 +35,7 @@ class Lanes:
         self.spec, self.options = spec, subject.options()
 
     def make(self, seeds: Sequence[int], autoreset: bool = True, shared: bool = False) -> LaneEnv:
-        """Return two lanes for each seed, with streams of their own, or one that they share, as in validation.
-
-        Raises
-        ------
-        BrokenRuleError
-            If the factory returns something else.
-        """
+        """Return two lanes for each seed, with streams of their own, or one that they share, as in validation."""
         lanes = len(seeds) * E
         if self.spec.vector is not None:
             envs: LaneEnv = specs.resolve(self.spec.vector)(self.options, lanes)

@@ -27,11 +27,6 @@ def select(word: str) -> list[CheckTarget]:
 
     A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
     own; `distribution:NAME` says so where it is not.
-
-    Raises
-    ------
-    QrlSuiteError
-        If it stands for things of several kinds, or for nothing; the message says what to type.
     """
     known = registry.load()
     if word.endswith(".toml"):
@@ -57,13 +52,7 @@ def select(word: str) -> list[CheckTarget]:
 
 
 def of_distribution(distribution: str) -> list[CheckTarget]:
-    """Return everything that a distribution registers.
-
-    Raises
-    ------
-    QrlSuiteError
-        If one of its plugins was skipped: why. If it brings nothing that there are rules for.
-    """
+    """Return everything that a distribution registers."""
     known = registry.load()
     problems = [p.problem for p in known.plugins if p.distribution == distribution and p.problem]
     if problems:

@@ -52,13 +52,6 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
         A registered circuit backend.
     values:
         Options of that backend; others have their defaults, whatever the entry was trained with.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such backend.
-    OptionError
-        If the entry's model has no circuit, no model computes it there, or an option cannot be used.
     """
     trained_on = getattr(entry.model_options, "backend", None)
     if trained_on is None:
@@ -131,11 +124,6 @@ class Deployment:
     ----------
     simulator:
         Whether the backend only simulates; else executions may cost money and queue.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the entry has no trained agents, or the backend cannot run their circuits.
     """
 
     def __init__(
@@ -188,13 +176,7 @@ class Deployment:
         return Cost(len(self.seeds), episodes, kept, circuits, self.shots, self._terms(circuits))
 
     def play(self, episodes: int, seed: int, report: Report = lambda name, done, total: None) -> Played:
-        """Play episodes, those of `qrlsuite.training.evaluation.trained`; finished rounds are kept.
-
-        Raises
-        ------
-        QrlSuiteError
-            If the backend fails; what is finished stays.
-        """
+        """Play episodes, those of `qrlsuite.training.evaluation.trained`; finished rounds are kept."""
         streams = Streams(self.entry.task.hash, seed)
         progress = [0]
 

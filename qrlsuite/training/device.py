@@ -12,26 +12,14 @@ if TYPE_CHECKING:
 
 
 def check(name: str) -> str:
-    """Return a device's name if there can be such a device; torch is not imported.
-
-    Raises
-    ------
-    OptionError
-        If the name is not `cpu`, `cuda` or `cuda:N`.
-    """
+    """Return a device's name if there can be such a device; torch is not imported."""
     if re.fullmatch(r"cpu|cuda(:\d{1,3})?", name) is None:
         raise OptionError(f"device = {name!r}: give cpu, cuda, or one GPU of several as cuda:1")
     return name
 
 
 def find(name: str) -> torch.device:
-    """Return the device of that name.
-
-    Raises
-    ------
-    OptionError
-        If there can be no such device, or this machine or this build of torch has none.
-    """
+    """Return the device of that name."""
     import torch
 
     device = torch.device(check(name))

@@ -152,15 +152,6 @@ def along_episodes(
         Episodes of each agent.
     report:
         Called with what is computed, and how far it is.
-
-    Raises
-    ------
-    OptionError
-        If there are no episodes.
-    StoreError
-        If there is no trained agent.
-    EnvironmentFailure
-        If the environment fails.
     """
     entry = evaluation.trained_entry(store, on)
     if getattr(entry.model_options, "backend", None) is not None:

@@ -112,13 +112,6 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
     -------
     tuple
         Their seeds, their last validation scores, and the number of runs to choose from.
-
-    Raises
-    ------
-    OptionError
-        If `count` is not positive.
-    StoreError
-        If no run has finished, or a file is damaged.
     """
     if count < 1:
         raise OptionError(f"--best {count}: at least one run is needed")
@@ -144,13 +137,7 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
 
 
 def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device: str = "cpu") -> Trainer:
-    """Return finished runs of an entry with their trained parameters, as one population that can act.
-
-    Raises
-    ------
-    StoreError
-        If a run has no parameters, they are not those of the entry's model, or its code has changed since.
-    """
+    """Return finished runs of an entry with their trained parameters, as one population that can act."""
     codes.require_installed(
         store, seeds, identity.of(store.entry())
     )  # not of another backend that they act on
@@ -176,13 +163,7 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
 
 
 def require_fitting(trainer: Trainer, agent: Mapping[str, NDArray[Any]], path: Path) -> None:
-    """Refuse trained parameters that are not those of a trainer's agents.
-
-    Raises
-    ------
-    StoreError
-        Naming the file that they are of, and what differs.
-    """
+    """Refuse trained parameters that are not those of a trainer's agents."""
     problem = _misfit({name: value[0] for name, value in _state(trainer).items()}, agent)
     if problem:
         raise StoreError(f"{path} does not fit the entry's model: {problem}")
@@ -218,13 +199,6 @@ def trained_entry(store: EntryStore, on: Task | None = None) -> Entry:
     ----------
     on:
         The task that they play, if it is not the one that they were trained on.
-
-    Raises
-    ------
-    StoreError
-        If it was imported from other files, and has no trained agents.
-    OptionError
-        If observations or actions of that task are others.
     """
     if store.record().get("imported"):
         raise StoreError(
@@ -287,15 +261,6 @@ def trained(
     perturb:
         Multiply every trained number by 1 + perturb * z, z standard normal, drawn anew for each agent and each round of
         `EVALUATION_LANES` episodes. Equal seeds draw equal z, whatever the scale.
-
-    Raises
-    ------
-    StoreError
-        If there is no trained agent.
-    OptionError
-        If the task has other observations or actions, or the scale is no positive number.
-    EnvironmentFailure
-        If the environment fails.
     """
     entry, name = trained_entry(store, on), policy_name(store, on)
     if not 0.0 <= perturb < np.inf:
@@ -336,15 +301,7 @@ def references(
     seed: int = 0,
     report: Report = lambda name, done, total: None,
 ) -> list[Played]:
-    """Evaluate the environment's reference policies, and the random one, on the episodes of `trained`.
-
-    Raises
-    ------
-    EnvironmentFailure
-        If the environment fails.
-    PluginError
-        If a reference policy cannot be built or does not give actions.
-    """
+    """Evaluate the environment's reference policies, and the random one, on the episodes of `trained`."""
     played = []
     for name, reference in entry.task.environment.policies.items():
         factory = specs.resolve(reference)
@@ -429,13 +386,6 @@ def play(
     -------
     tuple
         Returns (P, N), scores (P, N) or None where the task knows no maximum, and the number of steps of all.
-
-    Raises
-    ------
-    OptionError
-        If there is no episode to play.
-    EnvironmentFailure
-        If the environment fails, or an episode does not end.
     """
     if episodes < 1:
         raise OptionError(f"--episodes {episodes}: at least one is needed")

@@ -94,11 +94,6 @@ class Fence:
             What is called, for the message: `model 'waves', forward`.
         fine:
             Whether it is one of many, of which the first are watched.
-
-        Raises
-        ------
-        PluginError
-            If the call moved a global generator.
         """
         if not self.closed:
             return _OPEN

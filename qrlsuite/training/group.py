@@ -98,11 +98,6 @@ class GroupFiles:
         """Return the epoch and the state of the newest checkpoint; cut what is newer.
 
         Without one, the epoch is 0, and the state what `Trainer.start` takes: nothing, or the agents to begin with.
-
-        Raises
-        ------
-        StoreError
-            If the seeds cannot be continued, or a file is damaged.
         """
         epoch, arrays = checkpoint.load(self.store, self.seeds)
         for seed in self.seeds:
@@ -238,13 +233,7 @@ def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[A
 
 
 def _required_code(entry: Entry, entry_store: store.EntryStore) -> CodeIdentity:
-    """Return the identity of the code here, unless another one was sent to train the entry or has begun it.
-
-    Raises
-    ------
-    StoreError
-        Saying what differs.
-    """
+    """Return the identity of the code here, unless another one was sent to train the entry or has begun it."""
     code = identity.of(entry)
     codes.require_sent(entry_store, code, socket.gethostname())
     codes.require(entry_store, code)
@@ -278,13 +267,6 @@ class GroupRun:
     ----------
     files:
         The files of each entry, in the order of their agents in the population.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the entry cannot be built, or there is no such device.
-    ValueError
-        If the entries cannot be trained in one population, see `Entry.population_key`.
     """
 
     def __init__(
@@ -316,16 +298,7 @@ class GroupRun:
         self._lines: list[dict[str, Any]] = []
 
     def run(self) -> None:
-        """Train to the last epoch; on an interruption, save the last finished epoch and raise it again.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After an interruption, with everything saved.
-        EnvironmentFailure, PluginError, StoreError
-            If the environment raises, a plugin breaks a rule, or results cannot be written or are another worker's;
-            finished epochs stay.
-        """
+        """Train to the last epoch; on an interruption, save the last finished epoch and raise it again."""
         with Interruptible() as guard:
             try:
                 with guard.deferred():
@@ -393,13 +366,7 @@ class GroupRun:
             self.trainer.models.compile_circuits()
 
     def _judge(self, guard: Interruptible, probe: GroupProbe) -> None:
-        """Make the probe, and note what it found; an interruption ends it, and the same command makes it again.
-
-        Raises
-        ------
-        DependentSeedsError
-            If the seeds depend on each other.
-        """
+        """Make the probe, and note what it found; an interruption ends it, and the same command makes it again."""
         self.progress.phase = "probing"
         self.report(self.progress)
         found = probe.judge()
@@ -423,13 +390,7 @@ class GroupRun:
         self.report(self.progress)
 
     def _require_held(self) -> None:
-        """Refuse to write what is another worker's by now.
-
-        Raises
-        ------
-        StoreError
-            If it is.
-        """
+        """Refuse to write what is another worker's by now."""
         if not self.held():
             raise StoreError(
                 "another worker has taken these seeds over, and goes on from their last checkpoint: nothing more is "

@@ -33,11 +33,6 @@ def group_bytes(entry: Entry, seeds: int) -> int:
     """Return the bytes that a group of `seeds` needs in its process, at least.
 
     What the algorithm saves is there three times, for checkpoints, and the parameters once more as gradients.
-
-    Raises
-    ------
-    PluginError
-        If `memory` of the algorithm's or the model's spec fails, or returns something else than it should.
     """
     kept = algorithm_memory(entry.algorithm, entry.algorithm_options, entry.task.file.protocol.rounds)
     model = model_bytes(entry.model, entry.model_options, seeds, kept.batch, kept.networks * COPIES + 1)
@@ -45,13 +40,7 @@ def group_bytes(entry: Entry, seeds: int) -> int:
 
 
 def algorithm_memory(spec: specs.AlgorithmSpec, options: Any, rounds: int) -> Memory:
-    """Return what an algorithm's spec says that an agent keeps, the least that any keeps where it says nothing.
-
-    Raises
-    ------
-    PluginError
-        If its `memory` fails, or returns something else.
-    """
+    """Return what an algorithm's spec says that an agent keeps, the least that any keeps where it says nothing."""
     from qrlsuite.algorithm import Memory  # imports torch
 
     if spec.memory is None:
@@ -63,13 +52,7 @@ def algorithm_memory(spec: specs.AlgorithmSpec, options: Any, rounds: int) -> Me
 
 
 def model_bytes(spec: specs.ModelSpec, options: Any, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes that a model's spec says that a population takes, 0 where it says nothing.
-
-    Raises
-    ------
-    PluginError
-        If its `memory` fails, or returns something else.
-    """
+    """Return the bytes that a model's spec says that a population takes, 0 where it says nothing."""
     if spec.memory is None:
         return 0
     said: int = _call(spec, options, agents, batch, copies)
@@ -111,13 +94,7 @@ def available(meminfo: Path = Path("/proc/meminfo")) -> int | None:
 
 
 def require(entry: Entry, groups: Sequence[Sequence[int]], workers: int, free: int | None) -> None:
-    """Refuse groups of seeds of which `workers` at a time do not fit into `free` bytes; None means that it is unknown.
-
-    Raises
-    ------
-    OptionError
-        Saying how many seeds would fit.
-    """
+    """Refuse groups of seeds if `workers` of them do not fit into `free` bytes at once; None: unknown."""
     sizes = sorted((len(group) for group in groups), reverse=True)[:workers]
     needed = sum(group_bytes(entry, size) for size in sizes)
     if free is None or needed <= free:

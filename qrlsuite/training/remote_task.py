@@ -73,13 +73,7 @@ def pack(header: Mapping[str, Any], arrays: Arrays) -> bytes:
 
 
 def unpack(content: bytes) -> tuple[dict[str, Any], Arrays]:
-    """Return the header and the arrays of a task or an answer.
-
-    Raises
-    ------
-    StoreError
-        If the bytes are none.
-    """
+    """Return the header and the arrays of a task or an answer."""
     try:
         length = int.from_bytes(content[:8], "little")
         header = json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["header"])

@@ -92,13 +92,7 @@ class RunningStatistics:
         return self
 
     def observe(self, observations: NDArray[np.floating[Any]]) -> None:
-        """Gather the observations (S * E, ...) that a training step returned.
-
-        Raises
-        ------
-        ValueError
-            If one is not a finite number; nothing is gathered then.
-        """
+        """Gather the observations (S * E, ...) that a training step returned."""
         x = observations.reshape(len(self.mean), -1)
         if not np.isfinite(x).all():
             value = x[~np.isfinite(x)][0]

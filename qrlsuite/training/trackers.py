@@ -35,15 +35,7 @@ EVENTS = ("run_started", "epoch_finished", "run_finished")
 
 
 def parse(requests: Sequence[str], known: registry.Registry | None = None) -> dict[str, str | None]:
-    """Return targets by name from words `NAME` or `NAME=TARGET`; `known` is this process's registry by default.
-
-    Raises
-    ------
-    UnknownNameError
-        If no tracker has the name.
-    QrlSuiteError
-        If a package that a tracker needs is not installed; the message has the pip command.
-    """
+    """Return targets by name from words `NAME` or `NAME=TARGET`; `known` is this process's registry by default."""
     targets: dict[str, str | None] = {}
     for word in requests:
         name, equals, target = word.strip().partition("=")
@@ -135,13 +127,7 @@ class EventSink:
 
 
 def build(spec: specs.TrackerSpec, target: str | None) -> Any:
-    """Build a tracker.
-
-    Raises
-    ------
-    PluginError
-        If what its factory returns listens to nothing.
-    """
+    """Build a tracker."""
     tracker = specs.resolve(spec.factory)(target)
     if not any(callable(getattr(tracker, event, None)) for event in EVENTS):
         raise PluginError(f"{type(tracker).__name__} has none of the methods {', '.join(EVENTS)}")

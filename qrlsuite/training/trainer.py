@@ -53,13 +53,7 @@ Report = Callable[[Progress], None]
 
 @contextlib.contextmanager
 def _building(spec: specs.Spec) -> Iterator[None]:
-    """Turn whatever a plugin raises while something of it is built into one message with the place in its code.
-
-    Raises
-    ------
-    PluginError
-        Naming what could not be built, and its distribution.
-    """
+    """Turn whatever a plugin raises while something of it is built into one message with the place in its code."""
     try:
         yield
     except OptionError as error:
@@ -86,13 +80,7 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence 
 
 
 def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
-    """Refuse an algorithm that does not take the actions of the entry's environment.
-
-    Raises
-    ------
-    OptionError
-        Naming those that do.
-    """
+    """Refuse an algorithm that does not take the actions of the entry's environment."""
     try:
         kind = action_spaces.kind(space)
     except OptionError as error:
@@ -118,13 +106,7 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
 
 
 def require_trainable(entry: Entry) -> None:
-    """Refuse, by one agent that is built and not trained, what an algorithm, a model and a task cannot do together.
-
-    Raises
-    ------
-    QrlSuiteError
-        Saying what goes instead.
-    """
+    """Refuse, by one agent that is built and not trained, what an algorithm, a model and a task cannot do together."""
     if entry.model.name == specs.NO_MODEL:
         require_actions(entry, build_envs(entry, 1, lambda: None).single_action_space)
         return
@@ -166,13 +148,7 @@ class _FirstNetwork(Exception):
 
 
 def first_network(entry: Entry) -> nn.Module:
-    """Return one agent's freshly built first network; nothing is computed with it.
-
-    Raises
-    ------
-    OptionError
-        If the algorithm does not take the environment's actions, or asks for no network.
-    """
+    """Return one agent's freshly built first network; nothing is computed with it."""
     envs = build_envs(entry, 1, lambda: None)
     require_actions(entry, envs.single_action_space)
     own = int(np.prod(envs.single_observation_space.shape or (1,)))
@@ -282,11 +258,6 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         Lanes whose streams are set, with `autoreset` off.
     begin:
         Called after the reset; returns the policy, which may ask for more than observations (`informed`).
-
-    Raises
-    ------
-    EnvironmentFailure
-        If the environment fails, or an episode does not end within `MAX_EPISODE_STEPS`.
     """
     envs.take_finished()
     envs.take_metrics()
@@ -488,13 +459,6 @@ class Trainer:
         Epochs finished.
     algorithm:
         The learning algorithm, see `qrlsuite.algorithm.Algorithm`.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the entry cannot be built, or there is no such device.
-    ValueError
-        If the entries differ in more.
     """
 
     def __init__(
@@ -564,14 +528,6 @@ class Trainer:
         initial:
             Trained agents to begin with, seed-first, as `policy` returns them. All else is fresh: optimizers, buffers,
             counters, and networks that do not act. Nothing of them, or None: as each seed draws its own.
-
-        Raises
-        ------
-        StoreError
-            If they are not agents of this entry's model.
-        OptionError
-            If the algorithm keeps what it acts with outside of its networks, or observations are standardized by
-            running statistics.
         """
         if initial:
             self._build(self._places(initial))
@@ -612,13 +568,7 @@ class Trainer:
 
     @own.blamed()
     def train_epoch(self) -> Epoch:
-        """Train and validate one epoch.
-
-        Raises
-        ------
-        EnvironmentFailure
-            If the environment fails, or a score cannot be ranked.
-        """
+        """Train and validate one epoch."""
         before = self.models.executions()
         started, processor = time.perf_counter(), time.process_time()
         rounds = self.entry.task.file.protocol.rounds
@@ -686,13 +636,7 @@ class Trainer:
 
     @own.blamed()
     def restore(self, epoch: int, arrays: Arrays) -> None:
-        """Continue after an epoch, from what `capture` returned then.
-
-        Raises
-        ------
-        StoreError
-            If the arrays do not fit this entry.
-        """
+        """Continue after an epoch, from what `capture` returned then."""
         try:
             self.envs.inner.seed_lanes(unpack(arrays["streams"].reshape(self.S * self.E, -1)))
             lanes = {
@@ -766,11 +710,6 @@ class Trainer:
             Where an episode begins with the observation (S * L,).
         infos:
             What the lanes said of it.
-
-        Raises
-        ------
-        ValueError
-            If `begins` is absent, and the algorithm or its model needs it.
         """
         stacked = np.ascontiguousarray(observations, np.float32)
         seen = stacked.reshape(self.S, len(stacked) // self.S, -1)

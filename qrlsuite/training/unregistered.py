@@ -105,11 +105,6 @@ def require_none(
         it makes of them, so that a pass may change none.
     outputs:
         How many numbers a pass must return for each sample; None asks nothing of them.
-
-    Raises
-    ------
-    PluginError
-        Naming the attribute and what to write instead.
     """
     probe = build(0)
     before, other = held(probe), held(build(1))

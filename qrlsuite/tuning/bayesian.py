@@ -215,13 +215,6 @@ class Bayesian(Search):
         -------
         list
             A trial is None where some of its runs are left to another process or a queue.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After Ctrl-C, with everything saved.
-        QrlSuiteError
-            If a trial cannot be run.
         """
         if not self._next:
             raise RuntimeError("the search is over")

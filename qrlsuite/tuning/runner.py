@@ -77,13 +77,6 @@ def run(
     -------
     bool
         Whether all trials are over, none left to another process or a queue.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C, with everything saved.
-    QrlSuiteError
-        If a trial cannot be run.
     """
     try:
         budget = searches[0].request.seconds(where.workers)

@@ -329,13 +329,6 @@ class Search(Shown):
         -------
         list
             A trial is None where some of its runs are left to another process or a queue.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After Ctrl-C, with everything saved.
-        QrlSuiteError
-            If a trial cannot be run.
         """
         count = 1 if self.sampler.adaptive else min(most, self.planned - self.asked)
         proposals = [

@@ -48,11 +48,6 @@ class NativeBackend:
     ----------
     draws, gradient_circuits:
         Whether results are random, and if so how many circuits a gradient takes per input.
-
-    Raises
-    ------
-    OptionError
-        If gates connect too many qubits, options do nothing without others, or a mean-field approximation has shots.
     """
 
     def __init__(self, circuit: Circuit, options: NativeOptions | None = None) -> None:
@@ -87,11 +82,6 @@ class NativeBackend:
             Every declared parameter by name, (S, *shape), of the inputs' dtype and device.
         seeds:
             One per seed where shots or noise are simulated; see `qrlsuite.circuit.CircuitBackend`.
-
-        Raises
-        ------
-        OptionError
-            For wrong shapes or dtypes, missing parameters, or values that are not finite.
         """
         self._check(inputs, parameters)
         if self._sampler is not None:
@@ -106,13 +96,7 @@ class NativeBackend:
         return result
 
     def states(self, inputs: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the final states (S, B, 2^n), see `qrlsuite.circuit.CircuitBackend`.
-
-        Raises
-        ------
-        OptionError
-            For wrong shapes or dtypes, missing parameters, or a mean-field approximation, which has no state.
-        """
+        """Return the final states (S, B, 2^n), see `qrlsuite.circuit.CircuitBackend`."""
         if self.circuit.mean_field:
             raise OptionError("the mean-field approximation of a circuit has no state of all qubits")
         self._check(inputs, parameters)

@@ -127,11 +127,6 @@ class NativeDevice(Device):  # type: ignore[misc]  # PennyLane has no types
         As of every PennyLane device; None for exact values.
     seed:
         Of the shots: an integer, None for fresh entropy, or "global" for a draw from numpy's global generator.
-
-    Raises
-    ------
-    DeviceError
-        For more wires than the simulator has.
     """
 
     def __init__(self, wires: Any = None, shots: Any = None, seed: Any = "global") -> None:
@@ -412,13 +407,7 @@ def _observables(job: Job) -> Observables | None:
 
 
 def _word(word: Any, coefficient: Any, number: int, measurement: Any) -> Word:
-    """Return a term of an observable.
-
-    Raises
-    ------
-    DeviceError
-        If its coefficient is complex.
-    """
+    """Return a term of an observable."""
     exact = complex(qml.math.unwrap([coefficient])[0])
     if abs(exact.imag) > 1e-12 * max(1.0, abs(exact)):
         raise DeviceError(

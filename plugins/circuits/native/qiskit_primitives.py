@@ -111,13 +111,7 @@ class EstimatorV2(BaseEstimatorV2):  # type: ignore[misc]  # Qiskit has no types
         self.seed = seed
 
     def run(self, pubs: Iterable[Any], *, precision: float | None = None) -> Any:
-        """Return a job with the means of every pub, see Qiskit's `BaseEstimatorV2.run`.
-
-        Raises
-        ------
-        CircuitError
-            If a circuit has an operation without a definition, or too many qubits; for loops.
-        """
+        """Return a job with the means of every pub, see Qiskit's `BaseEstimatorV2.run`."""
         wanted = self.default_precision if precision is None else precision
         work = [
             (pub, _plan(pub, _turned(pub))) for pub in (EstimatorPub.coerce(each, wanted) for each in pubs)
@@ -152,13 +146,7 @@ class SamplerV2(BaseSamplerV2):  # type: ignore[misc]
         self.seed = seed
 
     def run(self, pubs: Iterable[Any], *, shots: int | None = None) -> Any:
-        """Return a job with the bits of every pub, see Qiskit's `BaseSamplerV2.run`.
-
-        Raises
-        ------
-        CircuitError
-            If a circuit has an operation without a definition, or too many qubits; for loops.
-        """
+        """Return a job with the bits of every pub, see Qiskit's `BaseSamplerV2.run`."""
         wanted = self.default_shots if shots is None else shots
         work = [(pub, _plan(pub)) for pub in (SamplerPub.coerce(each, wanted) for each in pubs)]
         job = PrimitiveJob(lambda: PrimitiveResult(list(map(self._result, work)), metadata={"version": 2}))
@@ -327,11 +315,6 @@ def _flat(
     """Yield operations that run as they are, with qubits and bits; all others by their definitions.
 
     The bits of a condition are those that it compares.
-
-    Raises
-    ------
-    CircuitError
-        If an operation has no definition.
     """
     for item in circuit.data:
         operation = item.operation
@@ -397,13 +380,7 @@ def _means(pub: Any, plan: Plan) -> NDArray[np.float64]:
 
 
 def _words(observable: Any, wires: Sequence[int]) -> list[tuple[dict[int, str], float]]:
-    """Return Pauli words by wire with their coefficients.
-
-    Raises
-    ------
-    CircuitError
-        If a term has projectors.
-    """
+    """Return Pauli words by wire with their coefficients."""
     words = []
     for label, coefficient in observable.items():
         if set(label) - set("IXYZ"):

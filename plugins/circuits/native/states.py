@@ -140,11 +140,6 @@ class StateProgram:
         `Operation`s, whose angles are inputs and constants, and `Matrix`es.
     prepared:
         Whether the samples bring initial states.
-
-    Raises
-    ------
-    ValueError
-        If there are more than `MAX_QUBITS` qubits.
     """
 
     def __init__(
@@ -335,13 +330,7 @@ def compiled(
 
 
 def refuse_width(qubits: int) -> None:
-    """Refuse states that would be too large.
-
-    Raises
-    ------
-    ValueError
-        If there are more than `MAX_QUBITS` qubits.
-    """
+    """Refuse states that would be too large."""
     if qubits > MAX_QUBITS:
         raise ValueError(
             f"{qubits} qubits: the state of one sample would take {_size(16 << qubits)}, and up to 8 samples are "

@@ -115,11 +115,6 @@ class BeamAngle(OneLane):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     def __init__(
@@ -180,15 +175,7 @@ class AngleLanes(LaneEnv):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Turn the beams by `actions` (L, 1), or point them there, radians.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        gymnasium.error.InvalidAction
-            If an action is none of the space.
-        """
+        """Turn the beams by `actions` (L, 1), or point them there, radians."""
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
@@ -220,24 +207,13 @@ class AngleLanes(LaneEnv):
         """Return the episodes' state, lane-first.
 
         `support_points` (L, degree, 2), `step` and `angle` (L,), `sums` (L, 2) and `observations` (L, 2 * stack).
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
         """
         if not self._begun:
             raise ResetNeeded("call reset() before state_dict()")
         return {name: value.copy() for name, value in self._state().items()}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes.
-
-        Raises
-        ------
-        qrlsuite.errors.StoreError
-            If an array is missing, has another shape, or holds what cannot be; nothing is changed then.
-        """
+        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes."""
         known = self._state()
         require_state("beam-angle", state, {name: value.shape for name, value in known.items()})
         trajectory.require_inside("beam-angle", state["support_points"])

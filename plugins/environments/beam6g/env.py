@@ -97,11 +97,6 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     * v1: first release with qrlsuite; differs from the paper's `BeamManagement6G` in ending episodes as
       terminated only, and in keeping paths that a rounding error would reject.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used; the message lists every problem.
     """
 
     # Gymnasium's checker tries every declared mode, so a window is declared where one can be shown.
@@ -150,13 +145,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode; `options={"support_points": (degree, 2)}` fixes its path.
-
-        Raises
-        ------
-        qrlsuite.errors.OptionError
-            If `options` has another key, or the support points cannot be used.
-        """
+        """Begin an episode; `options={"support_points": (degree, 2)}` fixes its path."""
         super().reset(seed=seed)
         settings = reset_options(options)
         support = (
@@ -177,15 +166,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
         return np.concatenate(self._frames), {}
 
     def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Let antenna `action` serve the user at the next position.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If no episode is running.
-        gymnasium.error.InvalidAction
-            If the action is not the index of an antenna.
-        """
+        """Let antenna `action` serve the user at the next position."""
         if self._support is None or self._step == self.options.steps:
             raise ResetNeeded("call reset() before step(): no episode is running")
         if not self.action_space.contains(action):
@@ -214,13 +195,6 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
 
         Returns an image (height, width, 3) uint8 for "rgb_array", text for "ansi", None for "human", which
         shows a window.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        gymnasium.error.DependencyNotInstalled
-            If "human" is asked for without pygame.
         """
         if self.render_mode is None:
             gymnasium.logger.warn(

@@ -57,13 +57,7 @@ class EpisodeGenerator:
         return trajectory.sample(streams, counts, self.options.degree, self.options.rejection)
 
     def support(self, raw_points: ArrayLike, lanes: int | None = None) -> FloatArray:
-        """Check support points given by a user and return them, (degree, 2) or (lanes, degree, 2).
-
-        Raises
-        ------
-        OptionError
-            If they have another shape, lie outside the field, or do not move.
-        """
+        """Check support points given by a user and return them, (degree, 2) or (lanes, degree, 2)."""
         points = np.array(raw_points, dtype=np.float64)
         shape = (self.options.degree, 2) if lanes is None else (lanes, self.options.degree, 2)
         if points.shape != shape:
@@ -110,13 +104,7 @@ class EpisodeGenerator:
 
 
 def reset_options(options: dict[str, Any] | None) -> Any:
-    """Return `support_points` of a reset's options, or None.
-
-    Raises
-    ------
-    OptionError
-        If there is any other key.
-    """
+    """Return `support_points` of a reset's options, or None."""
     unknown = sorted(set(options or {}) - {"support_points"})
     if unknown:
         raise OptionError(f"unknown reset option '{unknown[0]}'; known: support_points")

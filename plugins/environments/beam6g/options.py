@@ -88,12 +88,6 @@ def checked(index: int, antenna: Antenna) -> Antenna:
 
 
 def parse(values: Mapping[str, Any]) -> BeamOptions:
-    """Return the options that `values` describe.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If a key is unknown or a value cannot be used; the message lists every problem.
-    """
+    """Return the options that `values` describe."""
     options: BeamOptions = build(BeamOptions, values, "environment 'beam6g'")
     return options

@@ -200,11 +200,6 @@ class Window:
     ----------
     fps:
         Images per second at most.
-
-    Raises
-    ------
-    gymnasium.error.DependencyNotInstalled
-        If pygame is not installed.
     """
 
     def __init__(self, fps: int) -> None:

@@ -176,13 +176,7 @@ def sample(
 
 
 def require_inside(owner: str, support: FloatArray) -> None:
-    """Refuse saved support points (B, n, 2) that are none of the field; `owner` is the environment's name.
-
-    Raises
-    ------
-    qrlsuite.errors.StoreError
-        If a coordinate is outside, or not a number.
-    """
+    """Refuse saved support points (B, n, 2) that are none of the field; `owner` is the environment's name."""
     if not ((support >= 0.0) & (support <= FIELD)).all():
         raise StoreError(f"{owner}: 'support_points' must lie in the field, 0..{FIELD:g}")
 

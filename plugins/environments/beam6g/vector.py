@@ -53,13 +53,7 @@ class BeamLanes(LaneEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin a new episode in every lane; returns observations (L, 3 * stack) and an empty dictionary.
-
-        Raises
-        ------
-        qrlsuite.errors.OptionError
-            If `options` has another key than `support_points`, or these cannot be used.
-        """
+        """Begin a new episode in every lane; returns observations (L, 3 * stack) and an empty dictionary."""
         settings = reset_options(options)
         support = None if settings is None else self._simulator.support(settings, self.num_envs)
         if seed is not None or not self.streams:
@@ -74,15 +68,7 @@ class BeamLanes(LaneEnv):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Let antenna `actions` (L,) serve each lane's user at its next position.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        gymnasium.error.InvalidAction
-            If an action is not the index of an antenna.
-        """
+        """Let antenna `actions` (L,) serve each lane's user at its next position."""
         if self._support is None:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
@@ -113,11 +99,6 @@ class BeamLanes(LaneEnv):
 
         `support_points` (L, degree, 2), `step` (L,), `received` (L,), `observations` (L, 3 * stack), whose
         last three values hold the last action. The tables are computed again when they are needed.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
         """
         if self._support is None:
             raise ResetNeeded("call reset() before state_dict()")
@@ -129,13 +110,7 @@ class BeamLanes(LaneEnv):
         }
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes.
-
-        Raises
-        ------
-        qrlsuite.errors.StoreError
-            If an array is missing, has another shape, or holds what cannot be; nothing is changed then.
-        """
+        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes."""
         shapes = {
             "support_points": (self.num_envs, self.options.degree, 2),
             "step": (self.num_envs,),
@@ -174,25 +149,13 @@ class BeamLanes(LaneEnv):
 
     @property
     def support_points(self) -> NDArray[np.float64]:
-        """Support points of every lane's path (L, degree, 2).
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        """
+        """Support points of every lane's path (L, degree, 2)."""
         if self._support is None:
             raise ResetNeeded("call reset() before support_points")
         return self._support.copy()
 
     def tabulate(self) -> Tables:
-        """Return the tables of all lanes, those of newly begun episodes computed now.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        """
+        """Return the tables of all lanes, those of newly begun episodes computed now."""
         if self._support is None:
             raise ResetNeeded("call reset() before tabulate()")
         if self._tables is None:

@@ -102,11 +102,6 @@ class Channel(Drawn):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     lanes: ChannelLanes

@@ -126,11 +126,6 @@ class Clifford(Drawn):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     lanes: CliffordLanes
@@ -267,13 +262,7 @@ def _member(names: IntArray, known: IntArray) -> NDArray[np.bool_]:
 
 
 class ShortestCircuit:
-    """The reference policy that plays a shortest circuit, known by exhaustion: an optimum for two and three qubits.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If there are four qubits.
-    """
+    """The reference policy that plays a shortest circuit, known by exhaustion: an optimum for two and three qubits."""
 
     def __init__(self, envs: LaneEnv) -> None:
         self.envs = _lanes(envs)

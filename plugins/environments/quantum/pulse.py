@@ -145,11 +145,6 @@ class Pulse(Drawn):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     lanes: PulseLanes
@@ -360,11 +355,6 @@ class BestPulse:
     Switched fields: the best of all pulses, an optimum; the pulses of both halves of an episode are matched, from the
     start and back from the target. Continuous fields: the best that gradient ascent (GRAPE; exact gradients) finds from
     100 random pulses, or from fewer where it has a fidelity of 0.9999.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If there are too many pulses to go through.
     """
 
     def __init__(self, envs: LaneEnv) -> None:

@@ -150,11 +150,6 @@ class VQE(Drawn):
     ## Version History
 
     * v1: first version.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If an argument cannot be used.
     """
 
     lanes: VQELanes
