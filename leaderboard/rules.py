@@ -24,8 +24,6 @@ PAPER = "paper"
 """Another name for it."""
 TIMES = "times"
 """The rule by which boards rank, with Holm's correction over all pairs of a board."""
-GONE = ("difference", "difference-paired", "permutation")
-"""Rules of version 0.1."""
 
 _HERE = "qrlsuite.statistics.significance"
 _PERMUTATION = "qrlsuite.statistics.permutation"
@@ -64,8 +62,6 @@ def load(name: str = DEFAULT) -> SignificanceRule:
     try:
         registered = known.get(specs.RuleSpec, name)
     except UnknownNameError:
-        if name in GONE:
-            raise UnknownNameError(f"rule '{name}' is gone: take '{TIMES}'") from None
         choices = [PAPER, *known.names(specs.RuleSpec)]
         raise UnknownNameError(f"unknown rule '{name}'{nearest(name, choices)}") from None
     spec = registered.spec

@@ -17,13 +17,3 @@ HOOKS = {"register_commands": hookspec(lambda app: None)} | {
     name: hookspec(lambda register: None) for name in REGISTER
 }
 """Every hook: a function with its arguments."""
-
-_ALWAYS = "a method of a tracker: `register_trackers` with TrackerSpec(..., always=True)"
-RENAMED = {
-    "register": "one hook for each kind: `register_models`, `register_tasks`, ...",
-    "register_significance_tests": "`register_rules`, with RuleSpec",
-    "run_started": _ALWAYS,
-    "epoch_finished": _ALWAYS,
-    "run_finished": _ALWAYS,
-}
-"""Hooks of earlier versions, and what they are now."""

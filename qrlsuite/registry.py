@@ -219,8 +219,6 @@ class Registry:
         """Refuse implementations of hooks that do not exist (pluggy's `check_pending`, for one plugin)."""
         for caller in self.manager.get_hookcallers(plugin) or []:
             optional = all(i.optionalhook for i in caller.get_hookimpls() if i.plugin is plugin)
-            if caller.name in hookspecs.RENAMED:
-                raise PluginError(f"the hook '{caller.name}' is now {hookspecs.RENAMED[caller.name]}")
             if not caller.has_spec() and not optional:
                 raise PluginError(f"there is no hook '{caller.name}'{nearest(caller.name, hookspecs.HOOKS)}")
 

@@ -393,20 +393,10 @@ KINDS: dict[str, type[Spec]] = {
 """Every kind by its plural: a spec that is listed here has a hook, a listing, a page and checks."""
 
 
-_MANUAL = "documentation: docs/api/hooks.md"
-RENAMED = {
-    "significance_test": "`rule`", "significance_tests": "`rules`", "SignificanceTestSpec": "RuleSpec",
-    "hook": _MANUAL, "hooks": _MANUAL,
-}  # fmt: skip
-"""Words of earlier versions."""
-
-
 def kind(word: str) -> type[Spec]:
     """Return the kind that a word names, in the singular or the plural: `model`, `circuit-backends`."""
     known = {name: spec for spec in KINDS.values() for name in (spec.kind, spec.kinds)}
     name = word.replace("-", "_")
-    if name in RENAMED:
-        raise UnknownNameError(f"'{word}' is now {RENAMED[name]}")
     if name not in known:
         raise UnknownNameError(f"unknown kind '{word}'{nearest(word, known)}")
     return known[name]
@@ -415,9 +405,3 @@ def kind(word: str) -> type[Spec]:
 def title(kind: type[Spec], name: str) -> str:
     """Return what a thing is called in messages: `circuit backend 'native'`."""
     return f"{kind.kind.replace('_', ' ')} '{name}'"
-
-
-def __getattr__(name: str) -> Any:
-    if name in RENAMED:  # for plugins of earlier versions
-        raise PluginError(f"qrlsuite.specs.{name} is now {RENAMED[name]}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

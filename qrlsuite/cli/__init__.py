@@ -16,7 +16,7 @@ from typing import Any
 from typer import Abort, BadParameter
 
 from qrlsuite import registry
-from qrlsuite.cli.app import build, renamed_option, split_plugins
+from qrlsuite.cli.app import build, split_plugins
 from qrlsuite.engine.terminal import printable, printable_lines
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.registry import STRICT, PluginWarning
@@ -58,9 +58,6 @@ def main() -> None:
                 error.show()
             else:
                 message = printable(error.format_message()).removesuffix(".").replace("Value error, ", "")
-                option = getattr(error, "option_name", "")
-                if new := renamed_option(error.ctx.command_path.partition(" ")[2], option):
-                    message = f"{option} is gone: {new}"
                 print(f"qrlsuite: {message}; see `{error.ctx.command_path} --help`", file=sys.stderr)
             sys.exit(2)
         except KeyboardInterrupt:  # before the command began

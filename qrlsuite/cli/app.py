@@ -86,82 +86,6 @@ BUILT_IN = {
     )
 }
 
-RENAMED = {
-    "status": "qrlsuite runs",
-    "calibrate": "python benchmarks/calibration.py",
-    "leaderboard verify": "qrlsuite verify",
-    "decide new": "qrlsuite study new",
-    "decide run": "qrlsuite study run",
-    "decide end": "qrlsuite study end",
-    "decide plot": "qrlsuite study draw",
-    "decide show": "qrlsuite show STUDY",
-    "decide status": "qrlsuite show STUDY",
-    "decide export": "qrlsuite export",
-    "decide": "qrlsuite study",
-    "study list": "qrlsuite list studies",
-    "study show": "qrlsuite show STUDY",
-    "study status": "qrlsuite show STUDY",
-}
-"""Commands of earlier versions, one word or two, and what does their work now."""
-
-
-_ENTRY = "write it into the entry, [ALGORITHM] MODEL NAME=VALUE ... preset=FILE, as in"
-_ENGINE = "--engine 'slurm partition=gpu time=2:00:00'"
-_AFTER = "write it after the name, as in"
-_STUDY = {
-    "--set": f"{_AFTER} `qrlsuite study run fig6 qubits=6`",
-    "--model-map": f"{_AFTER} `qrlsuite study run fig6 vqc-native=vqc-pennylane`",
-    "--only": f"{_AFTER} `qrlsuite study run fig6 mlp`",
-}
-RENAMED_OPTIONS = {
-    "run": {"--algorithm": f"{_ENTRY} `qrlsuite run ppo mlp`", "--preset": f"{_ENTRY} `qrlsuite run mlp preset=FILE`"},
-    "tune": {
-        **dict.fromkeys(("--model", "--set", "--algorithm"), f"{_ENTRY} `qrlsuite tune 'mlp width=16'`"),
-        "--grid": "--vary paper, or --vary FILE.toml",
-        **dict.fromkeys(("--trials", "--sampler-seed"), "--sampler 'random trials=50 seed=1'"),
-        "--core-hours": "--budget 2core-hours",
-    },
-    "leaderboard": {
-        "--across": "--task A --task B",
-        "--min-seeds": "--entry chooses what is shown, --horizon leaves out shorter runs",
-        "--pairs": "--explain prints the matrix of all pairs, too",
-    },
-    "plot": {
-        "--set": f"{_AFTER} `qrlsuite plot surface style=3d`",
-        "--settings": "qrlsuite show picture KIND",
-        "--min-seeds": "--seeds 20 leaves out entries that lack one of these seeds",
-    },
-    "check": {"--set": f"{_AFTER} `qrlsuite check my-model width=4`"},
-    "show": {
-        **dict.fromkeys(("--qubits", "--layers", "--set"), f"{_AFTER} `qrlsuite show ansatz iqp qubits=4 layers=2`"),
-        "--figure": "--out FILE",
-    },
-    "export": {
-        **dict.fromkeys(("--across", "--rliable"), "qrlsuite export --task A --task B --out FILE.npz"),
-        "--all": "qrlsuite export all",
-    },
-    "study run": {**_STUDY, "--format": "qrlsuite study draw STUDY --format pdf"},
-    "study draw": _STUDY,
-    "study new": {
-        **dict.fromkeys(("--algorithm", "--preset"), f"{_ENTRY} 'ppo mlp preset=FILE'"),
-        **dict.fromkeys(("--alpha", "--margin", "--spending", "--first-seed", "--reason"),
-                        "--looks '20,40,60 alpha=.01 margin=.1 first_seed=10000', as the file's table [looks] has it"),
-    },
-    "verify": {"--choice": "--rerun '2 choice=31'"},
-    "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'", "--entanglement": "qrlsuite diagnose ENTRY"},
-    "": {
-        "--minutes": "--budget 30min",
-        **dict.fromkeys(("--partition", "--time", "--engine-set"), _ENGINE),
-    },
-}  # fmt: skip
-"""Options of earlier versions by command (all of them at last), and what to write now."""
-
-
-def renamed_option(command: str, option: str) -> str | None:
-    """Return what to write in the place of an option of an earlier version."""
-    return {**RENAMED_OPTIONS[""], **RENAMED_OPTIONS.get(command, {})}.get(option)
-
-
 PluginOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -217,9 +141,6 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return name, command and the remaining arguments, importing a built-in command."""
-        for words in (" ".join(args[:2]), args[0]):
-            if words in RENAMED and words not in self.commands:
-                raise OptionError(f"`qrlsuite {words}` is now `{RENAMED[words]}`")
         name, command, rest = super().resolve_command(ctx, args)
         return name, load(BUILT_IN[name]) if name in BUILT_IN else command, rest
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -137,12 +136,8 @@ def build(name: str, option_values: Mapping[str, Any]) -> Engine:
     if spec.options is not None:
         chosen = options.build(specs.resolve(spec.options), option_values, f"engine '{name}'")
     built: Engine = specs.resolve(spec.factory)(chosen)
-    run = getattr(built, "run", None)
-    if run is None or next(iter(inspect.signature(run).parameters), "") == "work":
-        raise PluginError(
-            f"engine '{name}' was written for an earlier version: `run(works, show)` takes a list of works and is what "
-            "every engine has, with or without `connect` (see `qrlsuite.engine.api`)"
-        )
+    if not callable(getattr(built, "run", None)):
+        raise PluginError(f"engine '{name}' has no method `run(works, show)` (see `qrlsuite.engine.api`)")
     return built
 
 

@@ -179,7 +179,6 @@ tidi => nothing called 'tidi' is registered; did you mean 'tidy'?
 engine:tidi => unknown engine 'tidi'; did you mean 'tidy'?
 engin:tidy => unknown kind 'engin'; did you mean 'engine'?
 distribution:tidi => no plugin is of a distribution 'tidi'; did you mean 'tidy'?
-significance-test:times => 'significance-test' is now `rule`
 cartpole => write qrlsuite check environment:cartpole or qrlsuite check task:cartpole or qrlsuite check study:cartpole
 local => 'local' is several things; write qrlsuite check engine:local or qrlsuite check distribution:local
 failing => 'failing' cannot be imported: RuntimeError: no license

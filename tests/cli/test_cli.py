@@ -14,11 +14,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from qrlsuite import own
 from qrlsuite.cli import main
-from qrlsuite.cli.app import RENAMED, build
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
@@ -309,19 +307,13 @@ run 'ddqn gru' --task cartpole => model 'gru' remembers what it saw in an episod
 run 'ddqn cnn' --task cartpole => model 'cnn' needs images, a Box of (height, width)
 run vqc-native qubits=4 linear=false --task pendulum => the circuit has 4 inputs and 4 expectation values, the actor 3
 study run mixed.toml => 'ddqn' takes discrete actions, and those of task 'pendulum' are Box(-2.0
-run mlp --task beam6g --minutes 3 => --minutes is gone: --budget 30min
-run mlp --task beam6g --preset x => --preset is gone: write it into the entry
 list modles => did you mean 'models'
-list hooks => 'hooks' is now documentation: docs/api/hooks.md
-list significance-tests => 'significance-tests' is now `rules`
-show hook register_models => 'hook' is now documentation: docs/api/hooks.md
 show mpl => did you mean 'mlp'
 show mlp width=4 => model 'mlp': NAME=VALUE, --out and --format draw an ansatz
 show picture barz => nothing called 'barz'; did you mean 'bars'
 show ansatz iqp cx => ansatz iqp cx: give one name
 show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
 show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
-show ansatz iqp --qubits 4 => --qubits is gone: write it after the name
 run mlp --task tiny => task 'tiny' is not registered, but in a file: write --task tiny.toml
 leaderboard --task tiny => in a file: write --task tiny.toml
 run mlp --task gone => unknown task 'gone'
@@ -335,21 +327,15 @@ show backend.toml => unknown circuit backend 'nativ'; did you mean 'native'
 show zero.toml => pictures.0.evaluation.deployed: shots = 0
 show option.toml => no option 'shot'; did you mean 'shots'
 show quantum-or-no => 'quantum-or-no'; did you mean 'quantum-or-not'?
-status => `qrlsuite status` is now `qrlsuite runs`
-leaderboard verify . => `qrlsuite leaderboard verify` is now `qrlsuite verify`
-calibrate => `qrlsuite calibrate` is now `python benchmarks/calibration.py`
 leaderboard --runs nowhere => there is no results folder nowhere
 leaderboard --format markdwn => 'markdwn' is not one of
 leaderboard --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
 runs --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
 runs --task /etc => unknown task '/etc'
 runs gc --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
-verify --choice 3 => --choice is gone: --rerun '2 choice=31'
 verify --rerun '2 choise=3' => --rerun 2 choise=3: write a number of seeds
 verify --rerun '2 choice=x' => choice is a whole number, which an earlier check printed
 export => name the entries to export, or say `export all`
-export --all => --all is gone: qrlsuite export all
-evaluate mlp --backend-set shots=3 => --backend-set is gone: --backend 'qiskit shots=1000'
 plot curves => `qrlsuite leaderboard --published` shows what comes with the suite
 plot curves --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
 plot curvs => unknown picture 'curvs'; did you mean 'curves'
@@ -360,8 +346,6 @@ plot histogram => drawn by: qrlsuite evaluate ENTRY
 plot estimator --task beam6g => picture 'estimator' shows no results: leave --task out
 plot bars wide => wide: write settings of the picture as NAME=VALUE
 plot bars --out x.gif => must be .png, .pdf or .svg
-plot bars --settings => --settings is gone: qrlsuite show picture KIND
-tune mlp --task beam6g --model mlp => --model is gone: write it into the entry
 tune width=4 --task tiny.toml => entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ...
 tune mlp mlp --task tiny.toml --out p.toml => for one entry
 tune mlp --task tiny.toml --vary papre => unknown grid 'papre'; did you mean 'paper'
@@ -378,8 +362,6 @@ study run fig6 --budget soon => write 90s, 30min, 8h
 study run fig6 --budget 0.2s => cannot hold one group
 study run fig6 --engine lokal => did you mean 'local'
 study run fig6 --seeds a:b => write a number (100)
-study run fig6 --partition x => --partition is gone: --engine 'slurm partition=gpu
-study run fig6 --set qubits=6 => --set is gone: write it after the name, as in `qrlsuite study run
 study run fig6 vqc-native=vqc-nativ => unknown model 'vqc-nativ'; did you mean 'vqc-native'
 study run fig6 nothing => study 'fig6' has no such entry
 study draw fig6 => nothing is trained yet: qrlsuite study run fig6
@@ -399,7 +381,6 @@ study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20,40 margin=0' => 
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=3 => seeds 0:4 are the protocol's
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=999999 => from 1000000 up are those of tuning
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20 margn=1' => option 'margn'; did you mean 'margin'
-study new p.toml --task tiny.toml mlp 'mlp width=4' --margin 0 => --margin is gone: --looks '20,40,60 alpha=.01
 study new p --task tiny.toml mlp 'mlp width=4' => p: a study file's name ends in .toml
 study new 'p q.toml' --task tiny.toml mlp 'mlp width=4' => name
 study new tiny.toml --task tiny.toml mlp 'mlp width=4' => tiny.toml is there already
@@ -445,12 +426,6 @@ def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     assert message in said[0]
     assert printed.out == ""
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before, "nothing is touched"
-
-
-@pytest.mark.parametrize("old", list(RENAMED))
-def test_a_command_of_earlier_versions_names_the_new_one(old: str) -> None:
-    result = CliRunner().invoke(build(), [*old.split(), "width.toml"])
-    assert str(result.exception) == f"`qrlsuite {old}` is now `{RENAMED[old]}`"
 
 
 def test_a_family_of_names_is_one_line_of_all_and_a_line_each_of_its_kind() -> None:

@@ -55,25 +55,6 @@ def test_the_example_of_a_command_works() -> None:
     assert "Hello, you." in CliRunner().invoke(app, ["hello"]).output
 
 
-UNPORTED = {
-    "register(register)": "the hook 'register' is now one hook for each kind: `register_models`, `register_tasks`",
-    "register_significance_tests(register)": "'register_significance_tests' is now `register_rules`, with RuleSpec",
-    "epoch_finished(run, record)": "'epoch_finished' is now a method of a tracker: `register_trackers` with "
-    "TrackerSpec(..., always=True)",
-    "register_rules(register): from qrlsuite.specs import SignificanceTestSpec": "qrlsuite.specs."
-    "SignificanceTestSpec is now RuleSpec",
-}
-
-
-@pytest.mark.parametrize(("hook", "answer"), UNPORTED.items(), ids=["one hook", "rules", "events", "spec"])
-def test_a_plugin_of_an_earlier_version_is_told_the_new_name(hook: str, answer: str) -> None:
-    code = f"from qrlsuite import hookimpl\n@hookimpl\ndef {hook if ': ' in hook else hook + ': pass'}\n"
-    with pytest.raises(registry.PluginError) as refused:
-        load("unported", code)
-    assert answer in str(refused.value)
-    assert len(str(refused.value).splitlines()) == 1
-
-
 ALWAYS = """
 from qrlsuite import hookimpl, specs
 

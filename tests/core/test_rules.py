@@ -93,8 +93,6 @@ def test_built_in_rules_are_registered_like_anyones() -> None:
     assert isinstance(rules.load(), IntervalRule), "the paper's rule is the default"
     with pytest.raises(UnknownNameError, match="did you mean 'intervals'"):
         rules.load("intervalls")
-    with pytest.raises(UnknownNameError, match="rule 'difference' is gone: take 'times'"):
-        rules.load("difference")
 
 
 def test_a_third_partys_rule_judges_pairs_and_boards(third_party: Callable[[type], Any]) -> None:
