@@ -88,8 +88,8 @@ def __getattr__(name: str) -> object:
     if name == "api" or name in _FROM_API:
         import importlib
 
-        api = importlib.import_module("qrlsuite.api")
-        return api if name == "api" else getattr(api, name)
+        module = importlib.import_module("qrlsuite.api")
+        return module if name == "api" else getattr(module, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -263,13 +263,13 @@ def _varied(entries: Sequence[EntryResults]) -> list[str]:
 
 
 def _model_options(entry: EntryResults) -> Mapping[str, Any]:
-    options: Mapping[str, Any] = entry.identity.get("model_options", {})
-    return options
+    values: Mapping[str, Any] = entry.identity.get("model_options", {})
+    return values
 
 
 def _environment_options(entry: EntryResults) -> Mapping[str, Any]:
-    options: Mapping[str, Any] = entry.identity.get("task", {}).get("environment_options", {})
-    return options
+    values: Mapping[str, Any] = entry.identity.get("task", {}).get("environment_options", {})
+    return values
 
 
 def _size(entry: EntryResults, by: str) -> float:

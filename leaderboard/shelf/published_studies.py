@@ -105,7 +105,7 @@ def read(folder: Path, labels: bool = True) -> StudyOutcome:
 
 
 def collected(
-    runs: Path, tasks: Sequence[str] = (), published: bool = False
+    runs: Path, tasks: Sequence[str] = (), with_published: bool = False
 ) -> tuple[list[StudyOutcome], list[str]]:
     """Return what the studies with looks of a results folder have decided, and a line for each unreadable one.
 
@@ -113,12 +113,12 @@ def collected(
     ----------
     tasks:
         Only studies of these tasks; all where empty.
-    published:
+    with_published:
         With those that come with the suite, but for those of which the folder has a copy of its own.
     """
     outcomes, refused = in_folder(runs, tasks)
     known = {outcome.study.hash for outcome in outcomes}
-    for name in names() if published else []:
+    for name in names() if with_published else []:
         try:
             outcome = read(PUBLISHED / name, labels=False)
         except QrlSuiteError as error:

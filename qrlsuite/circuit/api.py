@@ -147,12 +147,12 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     return circuit
 
 
-def options_on(own: type[Options], backend: str) -> type[Options]:
+def options_on(of_model: type[Options], backend: str) -> type[Options]:
     """Return the options of a circuit model and those of the backend that computes its circuits, as one class.
 
     Parameters
     ----------
-    own:
+    of_model:
         The model's, a frozen pydantic dataclass.
     backend:
         Name of the backend; the class variable `backend` of the result.
@@ -166,20 +166,20 @@ def options_on(own: type[Options], backend: str) -> type[Options]:
     """
     from qrlsuite import registry, specs
 
-    theirs = specs.resolve(registry.get(specs.CircuitBackendSpec, backend).options)
-    joined: type[Options] = _joined(cast(Any, own), theirs, backend)
+    of_backend = specs.resolve(registry.get(specs.CircuitBackendSpec, backend).options)
+    joined: type[Options] = _joined(cast(Any, of_model), of_backend, backend)
     return joined
 
 
 @functools.cache
-def _joined(own: Any, theirs: Any, backend: str) -> Any:
+def _joined(of_model: Any, of_backend: Any, backend: str) -> Any:
     from pydantic import ConfigDict
     from pydantic.dataclasses import dataclass
 
     from qrlsuite.options import field_names
 
-    names = {*field_names(own), *(name for name in vars(own) if not name.startswith("_"))}
-    if shared := sorted(names & set(dir(theirs)) | names & set(field_names(theirs))):
+    names = {*field_names(of_model), *(name for name in vars(of_model) if not name.startswith("_"))}
+    if shared := sorted(names & set(dir(of_backend)) | names & set(field_names(of_backend))):
         raise PluginError(
             f"circuit backend '{backend}': '{shared[0]}' of its options is one of the model's: give it another name"
         )
@@ -188,20 +188,20 @@ def _joined(own: Any, theirs: Any, backend: str) -> Any:
         self: Any,
     ) -> tuple[Any, ...]:  # a process that unpickles it finds no class of this name in a module
         values = {name: getattr(self, name) for name in field_names(type(self))}
-        return _with_values, (own, backend, values)
+        return _with_values, (of_model, backend, values)
 
     content = {
-        "__module__": own.__module__,
-        "__doc__": own.__doc__,
+        "__module__": of_model.__module__,
+        "__doc__": of_model.__doc__,
         "backend": backend,
         "__reduce__": reduced,
     }
-    made = type(f"{own.__name__}[{backend}]", (theirs, own), content)
+    made = type(f"{of_model.__name__}[{backend}]", (of_backend, of_model), content)
     return dataclass(frozen=True, config=ConfigDict(extra="forbid"))(made)
 
 
-def _with_values(own: type[Options], backend: str, values: Mapping[str, Any]) -> Options:
-    return options_on(own, backend)(**values)
+def _with_values(of_model: type[Options], backend: str, values: Mapping[str, Any]) -> Options:
+    return options_on(of_model, backend)(**values)
 
 
 def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBackend:

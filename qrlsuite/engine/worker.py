@@ -164,11 +164,11 @@ def _import_training() -> None:
     """
     gc.disable()
     try:
-        from qrlsuite.training import group
+        import qrlsuite.training.group as training
     finally:
         gc.freeze()
         gc.enable()
-    group.CHECKPOINT_SECONDS = checkpoint_seconds(group.CHECKPOINT_SECONDS)
+    training.CHECKPOINT_SECONDS = checkpoint_seconds(training.CHECKPOINT_SECONDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -113,14 +113,14 @@ def numerics(entry: Entry) -> dict[str, int]:
 
 def circuit_of(entry: Entry) -> Circuit | None:
     """Build the circuit that a model's options describe; None where they describe none that can be built."""
-    own = entry.model_options
+    values = entry.model_options
     try:
-        chosen = dict(getattr(own, "ansatz_options", {}))
-        known = options.field_names(specs.resolve(registry.get(specs.AnsatzSpec, own.ansatz).options))
-        for name in getattr(own, "passes_on", ()):
-            if name in known:
-                chosen.setdefault(name, getattr(own, name))
-        return circuit.ansatz(own.ansatz, own.qubits, own.layers, **chosen)
+        chosen = dict(getattr(values, "ansatz_options", {}))
+        names = options.field_names(specs.resolve(registry.get(specs.AnsatzSpec, values.ansatz).options))
+        for name in getattr(values, "passes_on", ()):
+            if name in names:
+                chosen.setdefault(name, getattr(values, name))
+        return circuit.ansatz(values.ansatz, values.qubits, values.layers, **chosen)
     except Exception:  # a stranger's builder, of which training says in better words what is wrong
         return None
 

@@ -229,17 +229,17 @@ def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> 
         Whether `source` is an exported entry, whose record has its code.
     """
     groups = of_seeds(store)
-    own = {digest: code for group in groups for digest, code in group.codes.items()}
+    present = {digest: code for group in groups for digest, code in group.codes.items()}
     if exported:
         code = read(source.record(), source.path / "entry.json")
-        theirs: Mapping[str, CodeIdentity | None] = {UNKNOWN if code is None else code.digest: code}
+        added: Mapping[str, CodeIdentity | None] = {UNKNOWN if code is None else code.digest: code}
     else:
-        theirs = {digest: code for group in of_seeds(source) for digest, code in group.codes.items()}
+        added = {digest: code for group in of_seeds(source) for digest, code in group.codes.items()}
     declared = _declared(source) + (_declared(store) if groups else [])
-    alike = _alike({**own, **theirs}, declared)
+    alike = _alike({**present, **added}, declared)
     if len(alike) < 2:
         return
-    before, other = ({**own, **theirs}[digests[0]] for digests in alike[:2])
+    before, other = ({**present, **added}[digests[0]] for digests in alike[:2])
     change = "of some, the code is not known"
     if before is not None and other is not None:
         change = listed(identity.differences(before.parts, other.parts))

@@ -340,9 +340,9 @@ def _nearest(subject: Speed, known: Sequence[Speed]) -> Speed | None:
     return min(same, key=lambda speed: _distance(subject.options, speed.options), default=None)
 
 
-def _work(options: Mapping[str, Any]) -> tuple[bool, Any, Any]:
+def _work(values: Mapping[str, Any]) -> tuple[bool, Any, Any]:
     """Return how circuits are computed: whether with shots, with which noise, and by which gradient."""
-    return options.get("shots") is not None, options.get("noise_model"), options.get("gradient") or "auto"
+    return values.get("shots") is not None, values.get("noise_model"), values.get("gradient") or "auto"
 
 
 def _distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:

@@ -245,15 +245,15 @@ class StudyOutcome(Shown):
 
     def _design(self) -> Iterator[str]:
         """Say what is fixed when the first seed is trained."""
-        study, looks = self.study, self.study.looks
+        study, section = self.study, self.study.looks
         family = len(study.design.family)
-        written = f"written {looks.written:%Y-%m-%d %H:%M} UTC, " if looks.written else ""
+        written = f"written {section.written:%Y-%m-%d %H:%M} UTC, " if section.written else ""
         yield f"{written}hash {study.hash}, not begun: it can be edited until its first seed begins"
         first = next(iter(study.entries.values()))
         yield f"task {study.task}, {study.epochs} epochs ({study.epochs * first.task.file.protocol.interactions} steps)"
         yield (
-            f"seeds {format_seeds(looks.block)}; any false difference with probability {looks.alpha:g} "
-            f"({counted(family, 'pair')}, {looks.spending} spending); equal within {100 * looks.margin:g} percent"
+            f"seeds {format_seeds(section.block)}; any false difference with probability {section.alpha:g} "
+            f"({counted(family, 'pair')}, {section.spending} spending); equal within {100 * section.margin:g} percent"
         )
         for level in self.levels():
             equal = "" if level["equal"] is None else f"; equal at p <= {level['equal']:.4f} on both sides"

@@ -151,13 +151,13 @@ def first_network(entry: Entry) -> nn.Module:
     """Return one agent's freshly built first network; nothing is computed with it."""
     envs = build_envs(entry, 1, lambda: None)
     require_actions(entry, envs.single_action_space)
-    own = int(np.prod(envs.single_observation_space.shape or (1,)))
+    size = int(np.prod(envs.single_observation_space.shape or (1,)))
 
     def ask(outputs: int, inputs: int | None = None, role: str = "network") -> nn.Module:
-        raise _FirstNetwork(outputs, own if inputs is None else inputs, role)
+        raise _FirstNetwork(outputs, size if inputs is None else inputs, role)
 
     if isinstance(envs.single_action_space, spaces.Discrete):
-        outputs, inputs, role = int(envs.single_action_space.n), own, "network"
+        outputs, inputs, role = int(envs.single_action_space.n), size, "network"
     else:
         try:
             specs.resolve(entry.algorithm.factory)(
@@ -278,9 +278,9 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         returns[first], scores[first] = sums[unfinished[lanes]], final_scores[unfinished[lanes]]
         lengths[first] = played
         for name, (where, values) in envs.take_metrics().items():
-            own = metrics.setdefault(name, np.full(envs.num_envs, np.nan))
+            row = metrics.setdefault(name, np.full(envs.num_envs, np.nan))
             new = unfinished[where]
-            own[where[new]] = values[new]
+            row[where[new]] = values[new]
         unfinished[lanes] = False
         if not unfinished.any():
             return Episodes(returns, scores, lengths, played, metrics)
@@ -329,21 +329,21 @@ class ModelBuilder:
         with _building(spec):
             build = specs.resolve(spec.build)
 
-            def agent(streams: Streams, own: Any) -> nn.Module:
+            def agent(streams: Streams, chosen: Any) -> nn.Module:
                 with seeded(stream_key(streams.task_hash, streams.seed, "build", call)):
                     generator = streams.torch("init", call)
-                    return build_agent(build, given, outputs, own, generator, self.space, role)
+                    return build_agent(build, given, outputs, chosen, generator, self.space, role)
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)
             both = options[0], options[0]
             stacked = spec.population is None
             if stacked:  # a stack keeps one agent's plain attributes for all
-                both = options[0], next((own for own in options if own != options[0]), options[0])
+                both = options[0], next((chosen for chosen in options if chosen != options[0]), options[0])
             unregistered.require_none(
                 lambda which: agent(two[which], both[which]), given, spec.name, stacked, outputs
             )
-            agents = [agent(streams, own) for streams, own in zip(self.streams, options)]
+            agents = [agent(streams, chosen) for streams, chosen in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))
             if spec.population is None:
@@ -558,8 +558,8 @@ class Trainer:
             value = initial.get(name)
             if value is None or value.size != tensor.numel():
                 raise StoreError(f"the agents to begin with do not fit the entry's model: '{name}'")
-            call, own = known[tensor.data_ptr()]
-            places.setdefault(call, {})[own] = torch.from_numpy(value).reshape(tensor.shape)
+            call, place = known[tensor.data_ptr()]
+            places.setdefault(call, {})[place] = torch.from_numpy(value).reshape(tensor.shape)
         return places
 
     def seed_environments(self) -> None:

@@ -500,7 +500,7 @@ class Search(Shown):
         """The finished trials from best to worst."""
         return sorted(self.trials, key=lambda trial: (trial.merit.order, trial.number))
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich_console__(self, console: Console, console_options: ConsoleOptions) -> RenderResult:
         """Show the best trials, a row each."""
         ranking = self.base.task.file.ranking
         rows = [

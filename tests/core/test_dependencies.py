@@ -112,6 +112,26 @@ def test_algorithms_import_neither_each_other_nor_a_model() -> None:
             assert not [name for name in imports(path, module) if name.startswith("qrlsuite.plugins")], module
 
 
+@pytest.mark.parametrize("module", sorted(ALL))
+def test_no_variable_has_the_name_of_a_module_that_its_file_imports(module: str) -> None:
+    nodes = [*ast.walk(ast.parse(ALL[module].read_text()))]
+    names = {
+        alias.asname or alias.name
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+        if isinstance(node, ast.Import) or f"{node.module}.{alias.name}" in ALL
+    }
+    bound = [
+        node.arg if isinstance(node, ast.arg) else node.id
+        for function in nodes
+        if isinstance(function, ast.FunctionDef | ast.Lambda)
+        for node in ast.walk(function)
+        if isinstance(node, ast.arg) or (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+    ]
+    assert not names.intersection(bound)
+
+
 def test_the_top_level_holds_what_plugins_and_users_import() -> None:
     files = {path.stem for path in FOLDERS["qrlsuite"].glob("*.py")} - {"__init__", "__main__"}
     assert files == TOP
