@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.times import rank_by_time
 from qrlsuite.leaderboard.shelf import collect, published, published_studies
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.results.text import counted
@@ -136,18 +137,14 @@ def check(study: Study) -> None:
                 options.build(backend, deployed.chosen(value), f"{location}.evaluation.deployed")
 
 
-def read(runs: Path, members: Sequence[Member], with_published: bool = False) -> dict[str, EntryResults]:
+def read(selection: Selection, members: Sequence[Member]) -> dict[str, EntryResults]:
     """Return the learning curves of the entries that have any, by entry name; seeds kept for tuning are left out.
 
-    Parameters
-    ----------
-    with_published:
-        Of an entry that comes with the suite, too, the copy that gets further is read, then that with more seeds.
+    Of an entry that comes with the suite, too, the copy that gets further is read, then that with more seeds.
     """
-    folders = [runs, *(published.folders() if with_published else ())]
     curves_by_name = {}
     for entry in {member.entry.name: member.entry for member in members}.values():
-        if copies := _copies(folders, entry):
+        if copies := _copies(selection.folders, entry):
             curves_by_name[entry.name] = collect.best(copies)
     return curves_by_name
 
@@ -170,11 +167,7 @@ def published_seeds(items: Iterable[PendingEntry]) -> dict[str, int]:
 
 
 def select(
-    name: str,
-    runs: Path,
-    tasks: Collection[str] = (),
-    with_published: bool = False,
-    horizon: int | None = None,
+    name: str, selection: Selection, horizon: int | None = None
 ) -> tuple[list[EntryResults], list[str]]:
     """Read a study's entries for a board of that study alone.
 
@@ -182,7 +175,7 @@ def select(
     ----------
     name:
         A study, or a study file's path.
-    tasks, with_published, horizon:
+    horizon:
         As for `collect.select`.
 
     Returns
@@ -190,15 +183,15 @@ def select(
     tuple
         The entries, and one line for each that was left out and why.
     """
-    members = [member for member in load(name).members() if not tasks or member.entry.task.name in tasks]
-    keys = {(member.entry.task.name, member.entry.name) for member in members}
+    runs, published_too = selection.runs, selection.published
+    entries = [member.entry for member in load(name).members()]
+    keys = {(e.task.name, e.name) for e in entries if not selection.tasks or e.task.name in selection.tasks}
     if not keys:
-        place = f" of task {' or '.join(tasks)}" if tasks else ""
-        raise OptionError(f"study '{name}' has no entry{place}")
-    selected, left_out = collect.select(runs, tasks, (), with_published, horizon, keys)
+        raise OptionError(f"study '{name}' has no entry{selection.of_tasks}")
+    selected, left_out = collect.select(dataclasses.replace(selection, only=keys), horizon=horizon)
     if not selected:
-        searched = f"{runs} and the published entries hold" if with_published else f"{runs} holds"
-        more = "" if with_published else "; --published shows those that come with the suite"
+        searched = f"{runs} and the published entries hold" if published_too else f"{runs} holds"
+        more = "" if published_too else "; --published shows those that come with the suite"
         raise UnknownNameError(f"{searched} no entry of study '{name}' yet: qrlsuite study run {name}{more}")
     return selected, left_out
 
@@ -227,17 +220,16 @@ def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
 def draw(
     study: Study,
     members: Sequence[Member],
-    runs: Path,
+    selection: Selection,
     report: Report | None = None,
-    with_published: bool = False,
     seeds: str | None = None,
 ) -> list[Drawn]:
     """Draw every picture of a study from the seeds finished so far.
 
     Parameters
     ----------
-    with_published:
-        As for `read`; pictures that play episodes show entries that were trained here.
+    selection:
+        Pictures that play episodes show entries of the results folder alone.
     seeds:
         Draw these alone, of every entry (`20`, `0:20`), so that all have equal numbers; None means all. Pictures that
         play episodes choose among all seeds, and are not drawn.
@@ -245,8 +237,8 @@ def draw(
         Told of the progress of episodes that a picture needs: policy, played, total.
     """
     check(study)
-    own = read(runs, members)  # those who can play: agents are not published
-    curves_by_name = read(runs, members, with_published) if with_published else own
+    own = read(Selection(selection.runs), members)  # those who can play: agents are not published
+    curves_by_name = read(selection, members) if selection.published else own
     if seeds is not None:
         curves_by_name = {name: entry.with_seeds(seeds) for name, entry in curves_by_name.items()}
     drawn = []
@@ -284,7 +276,7 @@ def draw_outcome(outcome: StudyOutcome) -> list[Drawn]:
     from qrlsuite.leaderboard.pictures import outcome as drawing
 
     study = Study(outcome.study.file, outcome.study.source)
-    own = draw(study, study.members(), outcome.study.folder) if study.file.pictures else []
+    own = draw(study, study.members(), Selection(outcome.study.folder)) if study.file.pictures else []
     figures = {"pairs": drawing.draw(outcome), "entries": drawing.draw_entries(outcome)}
     return [*(Drawn(name, name, (), figure=figure) for name, figure in figures.items()), *own]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import options, registry, specs
@@ -12,6 +11,7 @@ from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.experiment import task as task_files
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.specs import PictureSpec
@@ -42,13 +42,11 @@ class Composed:
 
 def compose(
     kind: str,
-    tasks: Sequence[str] = (),
+    written: Selection,
     entries: Sequence[str | EntryResults] = (),
     *,
     horizon: int | None = None,
     seeds: int | str | Iterable[int] | None = None,
-    runs: Path,
-    published: bool = False,
     settings: Mapping[str, Any],
     environment: Mapping[str, Any],
 ) -> Composed:
@@ -58,7 +56,9 @@ def compose(
     ----------
     kind:
         A name of `summaries`.
-    tasks, entries, horizon, runs, published:
+    written:
+        The tasks as they are written.
+    entries, horizon:
         As for `qrlsuite.leaderboard.shelf.collect.select`.
     seeds:
         Draw these alone, of every entry, see `EntryResults.with_seeds`; None means all.
@@ -67,15 +67,15 @@ def compose(
     environment:
         For a picture of an environment: options that replace the task's.
     """
-    spec = find(kind, tasks)
-    selection = {"--entry": entries, "--horizon": horizon, "--seeds": seeds}
+    spec = find(kind, written.tasks)
+    results = {"--entry": entries, "--horizon": horizon, "--seeds": seeds}
     if spec is None:
-        selection["--task"] = tasks
-    if (spec is not None or pictures.KINDS[kind].data is None) and any(selection.values()):
-        name = next(name for name, value in selection.items() if value)
+        results["--task"] = written.tasks
+    if (spec is not None or pictures.KINDS[kind].data is None) and any(results.values()):
+        name = next(name for name, value in results.items() if value)
         raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
     if spec is not None:
-        return _of_environment(kind, spec, tasks, settings, environment)
+        return _of_environment(kind, spec, written.tasks, settings, environment)
     if environment:
         raise OptionError(f"environment.{next(iter(environment))}: picture '{kind}' shows what was trained")
     data = pictures.KINDS[kind].data
@@ -87,8 +87,8 @@ def compose(
         return Composed(pictures.draw(kind, (), **settings))
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
-    tasks = collect.task_names(runs, tasks, published)
-    selected, left_out = collect.select(runs, tasks, entries, published, horizon)
+    selection = written.named()
+    selected, left_out = collect.select(selection, entries, horizon)
     if seeds is not None:
         wanted = read_seeds(seeds)
         lacking = [entry for entry in selected if not entries and set(wanted) - set(entry.seeds)]
@@ -106,12 +106,14 @@ def compose(
             left_out += short
     held = sorted({entry.task for entry in selected})
     if not selected:
-        of_task = f" of task {' or '.join(tasks)}" if tasks else ""
         raise UnknownNameError(
-            f"{runs} holds no results{of_task} yet: qrlsuite run; --published draws those that come with the suite"
+            f"{selection.runs} holds no results{selection.of_tasks} yet: qrlsuite run; --published draws those that "
+            "come with the suite"
         )
-    if len(held) > 1 and not tasks and not entries:
-        raise OptionError(f"{runs} holds several tasks; choose with --task {' or --task '.join(held)}")
+    if len(held) > 1 and not selection.tasks and not entries:
+        raise OptionError(
+            f"{selection.runs} holds several tasks; choose with --task {' or --task '.join(held)}"
+        )
     figure = pictures.draw(kind, selected, **{**own, **settings})
     return Composed(figure, tuple(selected), tuple(dict.fromkeys(e.task for e in selected)), tuple(left_out))
 

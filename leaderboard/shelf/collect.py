@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 
 from qrlsuite.engine.terminal import printable
@@ -20,33 +21,72 @@ Key = tuple[str, str]
 """An entry's task and name."""
 
 
-def collect(
-    runs: Path, tasks: Collection[str] = (), published: bool = False, only: Collection[Key] | None = None
-) -> tuple[list[EntryResults], list[str]]:
-    """Read every entry below a folder of results or of published entries.
+@dataclass(frozen=True)
+class Selection:
+    """From where entries are read, and which of them.
 
-    Parameters
+    Attributes
     ----------
-    tasks:
-        Read the entries of these; of all where empty. Of no meaning beside `only`.
+    runs:
+        The results folder.
     published:
-        Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
-        both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
-        own copy gets less far towards the task's shortest horizon, both are shown.
+        With the published entries that come with the suite. `runs` need not exist then.
+    tasks:
+        The entries of these tasks; of all where empty. Their names, or before `named` what the user wrote.
     only:
-        Read these alone, of studies or not. None reads what boards rank.
+        These entries alone, of studies or not, whatever their task; None for the entries that boards rank.
+    """
+
+    runs: Path
+    published: bool = False
+    tasks: tuple[str, ...] = ()
+    only: Collection[Key] | None = None
+
+    @classmethod
+    def create(
+        cls, runs: str | PathLike[str], task: str | Sequence[str] | None = None, published: bool = False
+    ) -> Selection:
+        """Make a selection from the arguments of a command or of `qrlsuite.api`, with tasks as they are written."""
+        return cls(Path(runs), published, (task,) if isinstance(task, str) else tuple(task or ()))
+
+    def of(self, *tasks: str) -> Selection:
+        """Return the selection of other tasks."""
+        return replace(self, tasks=tasks)
+
+    def named(self) -> Selection:
+        """Return the selection with the names of its tasks, see `qrlsuite.results.lookup.task_names`."""
+        return self.of(*lookup.task_names(self.runs, self.tasks, also=self.folders[1:]))
+
+    @property
+    def folders(self) -> list[Path]:
+        """The results folder, and those of published entries."""
+        return [self.runs, *(published_entries.folders() if self.published else ())]
+
+    @property
+    def of_tasks(self) -> str:
+        """Say which tasks: ` of task beam6g or cartpole`, empty for all."""
+        return f" of task {' or '.join(sorted(self.tasks))}" if self.tasks else ""
+
+
+def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
+    """Read every selected entry.
+
+    An entry that is in the results folder and published is shown once, the copy with more seeds: equal seeds are the
+    same runs, not further evidence. Where the own copy gets less far towards the task's shortest horizon, both are
+    shown.
 
     Returns
     -------
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
+    tasks, only = selection.tasks, selection.only
     good: dict[tuple[str, str, str], list[EntryResults]] = {}
     refused = []
     if only is None:
-        stores = [store for store in _folders(runs, published, tasks) if not tasks or _task(store) in tasks]
+        stores = [store for store in _stores(selection) if not tasks or _task(store) in tasks]
     else:
-        stores = _folders(runs, published, of_studies=True)
+        stores = _stores(selection, of_studies=True)
         stores = [store for store in stores if (_task(store), store.path.name) in only]
         absent = len(only) - len({(_task(store), store.path.name) for store in stores})
         if absent:
@@ -62,9 +102,9 @@ def collect(
             good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
     collected = []
     for copies in (copies for same in good.values() for copies in told_apart(same)):
-        shown = _shown(copies) if published else copies[-1:]
+        shown = _shown(copies) if selection.published else copies[-1:]
         collected += shown
-        for other in copies if published and len(shown) < len(copies) else ():
+        for other in copies if selection.published and len(shown) < len(copies) else ():
             if other is not shown[0]:
                 here, there = (
                     f"{len(each.seeds)} seeds of {each.curves.shape[1]} epochs" for each in (other, shown[0])
@@ -116,27 +156,15 @@ def _as_published(entry: EntryResults) -> EntryResults:
     return replace(entry, name=f"{entry.name}{BESIDE}", label=f"{entry.label} (published)")
 
 
-def task_names(runs: Path, tasks: Collection[str], published: bool = False) -> list[str]:
-    """Return the names of tasks, of a task file by its path: registered, or with entries here or published ones."""
-    return lookup.task_names(runs, tasks, also=published_entries.folders() if published else ())
-
-
 def select(
-    runs: Path,
-    tasks: Collection[str] = (),
-    names: Iterable[str | EntryResults] = (),
-    published: bool = False,
-    horizon: int | None = None,
-    only: Collection[Key] | None = None,
+    selection: Selection, names: Iterable[str | EntryResults] = (), horizon: int | None = None
 ) -> tuple[list[EntryResults], list[str]]:
     """Read the entries for a board or a picture.
 
     Parameters
     ----------
-    tasks, names:
-        The tasks and the entries (see `find`) to read; all where empty. Entries that were read stand as they are.
-    published, only:
-        As for `collect`.
+    names:
+        The entries (see `find`); all that are selected where empty. Entries that were read stand as they are.
     horizon:
         Environment steps: longer curves are cut to it, shorter entries left out. None cuts nothing.
 
@@ -148,14 +176,12 @@ def select(
     named = {
         (copy.task_hash, copy.name): copy
         for name in names
-        for copy in (
-            [name] if isinstance(name, EntryResults) else _shown(read_copies(runs, name, published, tasks))
-        )
+        for copy in ([name] if isinstance(name, EntryResults) else _shown(read_copies(selection, name)))
     }
     entries, left_out = list(named.values()), list[str]()
     if not named:
-        entries, left_out = collect(runs, tasks, published, only)
-        entries = [entry for entry in entries if not tasks or entry.task in tasks]
+        entries, left_out = collect(selection)
+        entries = [entry for entry in entries if not selection.tasks or entry.task in selection.tasks]
     else:
         left_out = [line for entry in entries for line in entry.refused]
     if horizon is not None:
@@ -221,17 +247,9 @@ def equally_long(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], l
     return kept, lines
 
 
-def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] = ()) -> EntryResults:
-    """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is.
-
-    Parameters
-    ----------
-    published:
-        Look among the published entries that come with the suite, too.
-    tasks:
-        Look among the entries of these tasks only; of all where empty.
-    """
-    return best(read_copies(runs, name, published, tasks))
+def find(selection: Selection, name: str) -> EntryResults:
+    """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is."""
+    return best(read_copies(selection, name))
 
 
 def best(copies: Iterable[EntryResults]) -> EntryResults:
@@ -239,15 +257,15 @@ def best(copies: Iterable[EntryResults]) -> EntryResults:
     return max(copies, key=_weight)
 
 
-def read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryResults]:
+def read_copies(selection: Selection, name: str) -> list[EntryResults]:
     """Read the copies of the entry that has a name, see `find`; `NAME @MARK` names its seeds of one code."""
     try:
-        found, mark = _every_copy(runs, name, published, tasks), ""
+        found, mark = _every_copy(selection, name), ""
     except UnknownNameError:
         base, at, mark = name.rpartition("@")
         if not at:
             raise
-        found = _every_copy(runs, base.rstrip(), published, tasks)
+        found = _every_copy(selection, base.rstrip())
     told = told_apart(found)
     if not mark and len(told) == 2 and told[1][0].name.endswith(BESIDE):
         return [copy for copies in told for copy in copies]
@@ -258,17 +276,19 @@ def read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) 
     return meant[0]
 
 
-def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryResults]:
+def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
+    tasks = selection.tasks
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        everything = lookup.stored(_folders(runs, published, tasks, of_studies=True))
+        everything = lookup.stored(_stores(selection, of_studies=True))
         everything = [entry for entry in everything if not tasks or entry.task in tasks]
-        on_boards = {store.path for store in _folders(runs, published, tasks)}
+        on_boards = {store.path for store in _stores(selection)}
         fitting = lookup.fitting(everything, name)
         # where entries of boards and of studies fit, those of boards are meant
         meant = [entry for entry in fitting if entry.store.path in on_boards] or fitting or everything
-        key = lookup.choose(list({e.key: e for e in meant}.values()), name, _place(runs, tasks)).key
+        place = f"{selection.runs}, {selection.of_tasks.removeprefix(' of ')}" if tasks else selection.runs
+        key = lookup.choose(list({e.key: e for e in meant}.values()), name, place).key
         folders = [entry.store for entry in everything if entry.key == key]
     copies = [entry for store in folders for entry in read_each(store)]
     if not copies:
@@ -293,11 +313,6 @@ def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
     return [further]
 
 
-def _place(runs: Path, tasks: Collection[str]) -> str:
-    """Say where an entry was looked for."""
-    return f"{runs}, task {' or '.join(sorted(tasks))}" if tasks else str(runs)
-
-
 def _weight(entry: EntryResults) -> tuple[int, int, int]:
     """Return what makes one of two copies of an entry the better one: epochs, seeds, epochs beyond the horizon."""
     epochs = int(entry.curves.shape[1])
@@ -305,23 +320,22 @@ def _weight(entry: EntryResults) -> tuple[int, int, int]:
     return min(epochs, enough), len(entry.seeds), epochs
 
 
-def _folders(
-    runs: Path, published: bool, tasks: Collection[str] = (), of_studies: bool = False
-) -> list[EntryStore]:
-    """Return the folders of what boards rank: the entries in the results folder, and with `published` those published.
+def _stores(selection: Selection, of_studies: bool = False) -> list[EntryStore]:
+    """Return the folders of the entries that boards rank: in the results folder, and published ones.
 
     Entries of studies are among them where `of_studies` asks for all, or if their task has no other published entries
-    and is named in `tasks` or has entries in the results folder.
+    and is selected by name or has entries in the results folder.
     """
-    if not runs.is_dir() and not published:
+    runs = selection.runs
+    if not runs.is_dir() and not selection.published:
         raise StoreError(
             f"there is no results folder {runs}: {ANOTHER_FOLDER}; `qrlsuite leaderboard --published` shows what "
             "comes with the suite"
         )
     stores = entries(runs) if runs.is_dir() else []
-    if published:
+    if selection.published:
         on_boards = entries(published_entries.PUBLISHED)
-        asked = {*tasks, *map(_task, stores)} - set(map(_task, on_boards))
+        asked = {*selection.tasks, *map(_task, stores)} - set(map(_task, on_boards))
         others = entries(published_entries.OF_STUDIES)
         stores += on_boards + [store for store in others if of_studies or _task(store) in asked]
     return stores

@@ -10,12 +10,13 @@ Verdicts are not stored: they are computed from the study and the curves.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.leaderboard.shelf import PLANS, collect, import_seeds, published
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.export import export as export_entry
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
@@ -104,21 +105,15 @@ def read(folder: Path, labels: bool = True) -> StudyOutcome:
     return StudyOutcome(study, study.read())
 
 
-def collected(
-    runs: Path, tasks: Sequence[str] = (), with_published: bool = False
-) -> tuple[list[StudyOutcome], list[str]]:
-    """Return what the studies with looks of a results folder have decided, and a line for each unreadable one.
+def collected(selection: Selection) -> tuple[list[StudyOutcome], list[str]]:
+    """Return what the studies with looks of some tasks have decided, and a line for each unreadable one.
 
-    Parameters
-    ----------
-    tasks:
-        Only studies of these tasks; all where empty.
-    with_published:
-        With those that come with the suite, but for those of which the folder has a copy of its own.
+    A study that the results folder and the suite have is read from the folder.
     """
-    outcomes, refused = in_folder(runs, tasks)
+    tasks = selection.tasks
+    outcomes, refused = in_folder(selection.runs, tasks)
     known = {outcome.study.hash for outcome in outcomes}
-    for name in names() if with_published else []:
+    for name in names() if selection.published else []:
         try:
             outcome = read(PUBLISHED / name, labels=False)
         except QrlSuiteError as error:

@@ -9,14 +9,13 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from qrlsuite.api.evaluation import find, the_task
+from qrlsuite.api.evaluation import find_players
 from qrlsuite.circuit import Circuit, ansatz
 from qrlsuite.circuit.api import require_computable
 from qrlsuite.diagnostics import circuits, fisher, fourier, gradients
@@ -27,6 +26,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import diagnosis as picture
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.training.diagnosis import EPISODES, MEASURES, PARAMETERS, Diagnosis, along_episodes
 
 SAMPLES, GAMMA = 10_000, 1.0
@@ -491,10 +491,7 @@ def diagnose(
         raise OptionError(
             "name an entry, or `ansatz` and the name of one, as in `qrlsuite diagnose ansatz iqp`"
         )
-    folder = Path(runs)
-    on = None if task is None else the_task(folder, task, published)
-    found = (find(folder, name, None if on is None else on.name, published) for name in entries)
-    stores = list({store.path.resolve(): store for store in found}.values())
+    on, stores = find_players(Selection.create(runs, task, published), entries)
     tasks = sorted({str(store.record()["task_name"]) for store in stores}) if on is None else [on.name]
     if len(tasks) > 1:
         raise OptionError(

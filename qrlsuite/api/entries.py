@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qrlsuite.api.arguments import Seeds, several
+from qrlsuite.api.arguments import Seeds
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import rules, studies
 from qrlsuite.leaderboard.boards import across
@@ -21,6 +21,7 @@ from qrlsuite.leaderboard.boards.pair import on_board
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results import lookup
 from qrlsuite.results.store import write_atomically
@@ -67,8 +68,7 @@ def load(
     >>> load("mlp width=64", task="beam6g", runs="none-yet", published=True).curves.shape
     (100, 100)
     """
-    folder = Path(runs)
-    return collect.find(folder, entry, published, collect.task_names(folder, several(task), published))
+    return collect.find(Selection.create(runs, task, published).named(), entry)
 
 
 def board(
@@ -140,9 +140,9 @@ def board(
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
-    folder = Path(runs)
-    task_names = collect.task_names(folder, several(task), published)
-    together = task_names if len(task_names) > 1 else ()
+    written = Selection.create(runs, task, published)
+    selection = written.named()
+    together = selection.tasks if len(selection.tasks) > 1 else ()
     if rule is not None and (together or by != "steps"):
         other = "several tasks" if together else f"by = '{by}'"
         raise OptionError(f"--rule {rule} judges cells of one task in environment steps: not {other}")
@@ -150,23 +150,23 @@ def board(
     if study is not None and entries:
         raise OptionError(f"--study {study} names the entries: leave --entry out")
 
-    def select(names: Sequence[str], chosen: Sequence[str | EntryResults]) -> Selected:
+    def select(among: Selection, chosen: Sequence[str | EntryResults]) -> Selected:
         if study is None:
-            return collect.select(folder, names, chosen, published, horizon)
-        return studies.select(study, folder, names, published, horizon)
+            return collect.select(among, chosen, horizon)
+        return studies.select(study, among, horizon)
 
-    definitions = lookup.definitions(several(task))
+    definitions = lookup.definitions(written.tasks)
     if together:
-        found, left_out = across.collected(together, lambda task: select([task], entries))
+        found, left_out = across.collected(together, lambda task: select(selection.of(task), entries))
         return boards.build(
             found, left_out, None, horizon, alpha, by=by, together=together, definitions=definitions
         )
-    shown, left_out = select(task_names, entries)
+    shown, left_out = select(selection, entries)
     keys = {(entry.task_hash, entry.name) for entry in shown}
     family = shown
     read = any(isinstance(entry, EntryResults) for entry in entries)
     if entries and not read and by not in UNITS:
-        family = _family(shown, select(task_names, ())[0])
+        family = _family(shown, select(selection, ())[0])
     return boards.build(
         family,
         left_out,
@@ -180,13 +180,7 @@ def board(
 
 
 def write_page(
-    out: Path | None,
-    tasks: Sequence[str],
-    by: str,
-    runs: Path,
-    published: bool,
-    study: str | None,
-    **asked: Any,
+    out: Path | None, written: Selection, by: str, study: str | None, **asked: Any
 ) -> tuple[Path | None, list[str]]:
     """Write boards as a page, with the studies with looks of their tasks.
 
@@ -194,7 +188,9 @@ def write_page(
     ----------
     out:
         None writes leaderboard.html in the results folder.
-    tasks, by, runs, published, study, asked:
+    written:
+        The tasks as they are written.
+    by, study, asked:
         As for `board`.
 
     Returns
@@ -205,14 +201,15 @@ def write_page(
     from qrlsuite.leaderboard import report
     from qrlsuite.leaderboard.shelf import published_studies
 
-    asked |= {"runs": runs, "published": published, "study": study}
+    tasks, runs = written.tasks, written.runs
+    asked |= {"runs": runs, "published": written.published, "study": study}
     beside = None if len(tasks) < 2 and by == "steps" else board(tasks, by=by, **asked)
     shown = [board(names, **asked) for names in [[task] for task in tasks] or [[]]]
     sections = tuple(section for one in shown for section in one.sections)
-    held = collect.task_names(runs, tasks, published) or (
-        sorted({section.task for section in sections}) if study is not None else []
-    )
-    outcomes, unreadable = published_studies.collected(runs, held, published)
+    named = written.named()
+    if study is not None and not tasks:
+        named = named.of(*sorted({section.task for section in sections}))
+    outcomes, unreadable = published_studies.collected(named)
     every = (*shown, *([beside] if beside else []))
     refused = list(dict.fromkeys(line for one in every for line in one.refused)) + list(unreadable)
     if not sections and not outcomes:
@@ -288,7 +285,7 @@ def compare(
     compared = compare_entries(left, other, rules.load(rule) if rule else None)
     if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared
-    others, left_out = collect.collect(Path(runs), [left.task], published)
+    others, left_out = collect.collect(Selection(Path(runs), published, (left.task,)))
     among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
     places = (f"of the same entry, from {left.folder}", f"of the same entry, from {other.folder}")
     copies = [f"left out: {line}" for line in left_out if line.endswith(places)]
@@ -348,12 +345,10 @@ def plot(
         raise OptionError(f"plot takes `task`, one or several: write task={settings['tasks']!r}")
     drawn = compose(
         kind,
-        several(task),
+        Selection.create(runs, task, published),
         entries,
         horizon=horizon,
         seeds=seeds,
-        runs=Path(runs),
-        published=published,
         settings=settings,
         environment=environment or {},
     )

@@ -28,6 +28,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.gymlanes import GymLanes
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import write_atomically
 from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
@@ -160,16 +161,9 @@ def _ffmpeg() -> str:
     return found
 
 
-def record(
-    runs: Path,
-    entry: str,
-    task: str | None = None,
-    number: int = 0,
-    seed: int = 0,
-    published: bool = False,
-) -> Episode:
+def record(written: Selection, entry: str, number: int = 0, seed: int = 0) -> Episode:
     """Play an episode with an entry's best trained agent, and draw it: see `qrlsuite.api.play`."""
-    agent = load(runs, entry, task, None, published)
+    agent = load(written, entry)
     played = agent.entry
     drawn = _Drawn(played)  # before anything is played
     streams = Streams(played.task.hash, seed)

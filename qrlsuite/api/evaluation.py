@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from qrlsuite.experiment.task import Task, load
 from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf import published as published_entries
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.published import PublishedAgents
 from qrlsuite.notation import parse_named
@@ -141,9 +142,8 @@ def _row(played: Played, label: str) -> list[str]:
 
 
 def evaluate(
-    runs: Path,
+    written: Selection,
     names: Sequence[str],
-    task: str | None = None,
     best: int = 10,
     episodes: int = 1000,
     seed: int = 0,
@@ -151,21 +151,19 @@ def evaluate(
     progress: bool = True,
     backend: str | None = None,
     yes: bool = False,
-    published: bool = False,
     perturb: Sequence[float] = (),
 ) -> Evaluation:
     """Play fresh episodes with the best trained agents of some entries, and with the reference policies.
 
     Parameters
     ----------
-    runs:
-        The results folder.
+    written:
+        Its task, by name or file, is the one that is played. Entries are looked for among its own; one that is named
+        with another task before it (`TASK/ENTRY`), or by its folder, plays it too, where observations and actions are
+        the same. Without a task the entries play their own.
     names:
         The entries, of one task, as `qrlsuite.leaderboard.shelf.collect.find` finds them; none are the reference
-        policies of `task` alone.
-    task:
-        The task that is played, by name or file. Entries are looked for among its own; one that is named with another
-        task before it (`TASK/ENTRY`), or by its folder, plays it too, where observations and actions are the same.
+        policies of the task alone.
     best, episodes, seed, device:
         As for `qrlsuite.training.evaluation.trained`.
     progress:
@@ -175,8 +173,6 @@ def evaluate(
         `qrlsuite.training.deployment`. What this costs is said first; finished episodes are kept.
     yes:
         Execute circuits on a device that is no simulator.
-    published:
-        Look among the published entries that come with the suite, too.
     perturb:
         Play every entry with its parameters perturbed by each of these relative sizes, too.
 
@@ -190,13 +186,11 @@ def evaluate(
     StoreError
         If an entry has no trained agent.
     """
-    if not names and (task is None or backend or perturb):
+    if not names and (not written.tasks or backend or perturb):
         raise OptionError(
             "name at least one entry to evaluate, or --task alone for a task's reference policies"
         )
-    on = None if task is None else the_task(runs, task, published)
-    found = (find(runs, name, None if on is None else on.name, published) for name in names)
-    stores = list({store.path.resolve(): store for store in found}.values())
+    on, stores = find_players(written, names)
     if on is None:
         _one_task(stores)
     there = parse_named(backend, "--backend ") if backend else None
@@ -242,31 +236,38 @@ def evaluate(
     )
 
 
-def the_task(runs: Path, name: str, published: bool = False) -> Task:
-    """Return a task: a registered one, a file's, or one that entries here have.
+def find_players(written: Selection, names: Iterable[str]) -> tuple[Task | None, list[EntryStore]]:
+    """Return the task that is played, None where entries play their own; and where their trained agents are.
 
     Raises
     ------
     UnknownNameError
-        With the nearest name.
+        If the task is unknown, or none or several entries have a name.
+    StoreError
+        If an entry is published, and without agents.
     """
+    on = _task(written) if written.tasks else None
+    selection = written if on is None else written.of(on.name)
+    found = (find(selection, name) for name in names)
+    return on, list({store.path.resolve(): store for store in found}.values())
+
+
+def _task(written: Selection) -> Task:
+    """Return a task: a registered one, a file's, or one that entries here have."""
+    [name] = written.tasks
     registered = name.endswith(".toml") or name in registry.load().of(specs.TaskSpec)
-    if registered:
-        return load(name)
-    collect.task_names(runs, [name], published)
-    for folder in (runs, *(published_entries.folders() if published else ())):
-        if folder.is_dir() and (stores := entries(folder, name)):
-            return stores[0].entry().task
+    if not registered:
+        written.named()  # it is known
+        for folder in written.folders:
+            if folder.is_dir() and (stores := entries(folder, name)):
+                return stores[0].entry().task
     return load(name)
 
 
-def find(runs: Path, name: str, task: str | None = None, published: bool = False) -> EntryStore:
+def find(selection: Selection, name: str) -> EntryStore:
     """Return where the trained agents of an entry are; of copies that have some, the better one.
 
-    Parameters
-    ----------
-    task:
-        Look among the entries of this task, unless the name says which one: `TASK/ENTRY`, or a folder.
+    The selection's task is looked into, unless the name says which one: `TASK/NAME`, or a folder.
 
     Raises
     ------
@@ -277,22 +278,23 @@ def find(runs: Path, name: str, task: str | None = None, published: bool = False
     """
     before, slash, _ = name.partition("/")
     placed = (Path(name) / "entry.json").exists() or (slash and "=" not in before)
+    anywhere = selection.of()
     try:
-        copies = collect.read_copies(runs, name, published, [] if placed or task is None else [task])
+        copies = collect.read_copies(anywhere if placed else selection, name)
     except UnknownNameError as error:
-        if placed or task is None:
+        if placed or not selection.tasks:
             raise
         try:
-            other = collect.read_copies(runs, name, published, [])[0].task
+            other = collect.read_copies(anywhere, name)[0].task
         except UnknownNameError:
             raise error from None
         raise UnknownNameError(
-            f"task '{task}' has no entry '{name}' in {runs}; to let agents play it that were trained on '{other}', "
-            f"write '{other}/{name}'"
+            f"task '{selection.tasks[0]}' has no entry '{name}' in {selection.runs}; to let agents play it that were "
+            f"trained on '{other}', write '{other}/{name}'"
         ) from None
     chosen = collect.best([copy for copy in copies if _has_agents(copy)] or copies)
     if chosen.source == "published":
-        return PublishedAgents(chosen.folder, runs)
+        return PublishedAgents(chosen.folder, selection.runs)
     return EntryStore(chosen.folder)
 
 

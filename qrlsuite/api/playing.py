@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.shelf.collect import Selection
 
 if TYPE_CHECKING:
     from qrlsuite.api.episode import Episode
@@ -56,7 +56,7 @@ def agent(
         raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
     from qrlsuite.api import trained  # torch, which all other functions do without
 
-    return trained.load(Path(runs), entry, task, seed, published)
+    return trained.load(Selection.create(runs, task, published), entry, seed)
 
 
 def play(
@@ -112,4 +112,4 @@ def play(
             raise OptionError(f"{name} = {value!r}: give a whole number, 0 or more")
     from qrlsuite.api import episode as episodes  # torch, which all other functions do without
 
-    return episodes.record(Path(runs), entry, task, episode, seed, published)
+    return episodes.record(Selection.create(runs, task, published), entry, episode, seed)

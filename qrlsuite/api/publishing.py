@@ -18,6 +18,7 @@ from qrlsuite.leaderboard.boards.across import Shares
 from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf import verify as checks
 from qrlsuite.leaderboard.shelf.changed import changed
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.notation import parse_named
@@ -105,13 +106,13 @@ def export(
             folder = published_studies.export(StudyWithLooks(study, runs), target, agents)
             yield Exported(folder=folder)
         return
-    tasks = collect.task_names(runs, tasks)
+    selection = Selection.create(runs, tasks).named()
     if everything or named:
-        chosen = [studies.select(name, runs, tasks) for name in named] or [collect.collect(runs, tasks)]
+        chosen = [studies.select(name, selection) for name in named] or [collect.collect(selection)]
         selected = list({entry.folder: entry for entries, _ in chosen for entry in entries}.values())
         yield from (Exported(problem=line) for _, refused in chosen for line in refused)
     else:
-        selected = [collect.find(runs, name, tasks=tasks) for name in names]
+        selected = [collect.find(selection, name) for name in names]
     target, written = out or Path("leaderboard/unranked" if named else "leaderboard/entries"), 0
     for entry in selected:
         try:
@@ -144,9 +145,11 @@ def export_rliable(file: Path, tasks: Sequence[str], names: Sequence[str], runs:
     """
     if len(tasks) < 2:
         raise OptionError(f"--out {file}: name two tasks or more, as --task A --task B")
-    tasks = collect.task_names(runs, tasks)
-    entries, refused = across.collected(tasks, lambda task: collect.select(runs, [task], names))
-    shares = across.shares(entries, tasks, refused=refused)
+    selection = Selection.create(runs, tasks).named()
+    entries, refused = across.collected(
+        selection.tasks, lambda task: collect.select(selection.of(task), names)
+    )
+    shares = across.shares(entries, selection.tasks, refused=refused)
     arrays: dict[str, Any] = shares.rliable()
     content = io.BytesIO()
     np.savez(content, **arrays)

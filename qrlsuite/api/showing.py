@@ -19,6 +19,7 @@ from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.leaderboard.pictures import compose
 from qrlsuite.leaderboard.shelf import collect, published_studies
 from qrlsuite.leaderboard.shelf import published as published_entries
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results import codes, lookup
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, entries, write_atomically
@@ -90,7 +91,7 @@ def describe(
         return read_study(name, runs=folder, published=published)
     if kind in (None, PICTURE) and not found and name in compose.summaries():
         return compose.describe(name)
-    if not found and kind is None and (store := _stored(folder, name, published)):
+    if not found and kind is None and (store := _stored(Selection(folder, published), name)):
         return _code_of_entry(store) if code else _outline(store)
     if not found:
         names = [each for spec in among for each in known.of(spec)] or list(compose.summaries())
@@ -160,7 +161,7 @@ def _code_of_plugin(kind: type[specs.Spec], name: str) -> dict[str, Any]:
     return dict(identity.of_registered(kind, name, None))
 
 
-def _stored(runs: Path, name: str, published: bool) -> EntryStore | None:
+def _stored(selection: Selection, name: str) -> EntryStore | None:
     """Find an entry by its folder, or by what it is called in the results folder; None where nothing fits.
 
     Raises
@@ -170,8 +171,9 @@ def _stored(runs: Path, name: str, published: bool) -> EntryStore | None:
     """
     if (Path(name) / "entry.json").exists():
         return EntryStore(Path(name))
-    if published:
-        return EntryStore(collect.find(runs, name, published).folder)
+    if selection.published:
+        return EntryStore(collect.find(selection, name).folder)
+    runs = selection.runs
     if not runs.is_dir():
         return None
     stored = lookup.stored(entries(runs))

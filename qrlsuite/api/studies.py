@@ -24,6 +24,7 @@ from qrlsuite.experiment import identity
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures import FORMATS
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.studies import Drawn
 from qrlsuite.options import from_mapping
 from qrlsuite.results import speed
@@ -188,7 +189,7 @@ def read_study(
         return studies.read_outcome(name, folder)
     where, members = Where.create(), study.members()
     items = study_runner.find_pending(members, folder, where, speed.known(folder), None, None)
-    pairs = studies.decided_pairs(studies.read(folder, members, published).values())
+    pairs = studies.decided_pairs(studies.read(Selection(folder, published), members).values())
     counts = studies.published_seeds(items) if published else None
     return study_runner.Overview(study, items, where.workers, pairs, counts)
 
@@ -317,7 +318,7 @@ def draw_study(
     else:
         shown = study.name
         members = study_runner.select(study, from_mapping(options), models, several(only))
-        pictures = studies.draw(study, members, folder, with_published=published, seeds=seeds)
+        pictures = studies.draw(study, members, Selection(folder, published), seeds=seeds)
     drawn = studies.write(shown, pictures, folder, format)
     if not any(each.path for each in drawn):
         reasons = sorted({each.problem for each in drawn})
@@ -387,7 +388,9 @@ class StudyWork:
                 session.run(self.items(members))
             except KeyboardInterrupt as stopped:
                 interrupt = stopped
-            drawn = studies.write(study.name, studies.draw(study, members, self.runs), self.runs, format)
+            drawn = studies.write(
+                study.name, studies.draw(study, members, Selection(self.runs)), self.runs, format
+            )
             overview = study_runner.Overview(study, self.items(members), self.where.workers)
             handed = tuple(session.submitted[submitted:])
             yield StudyRun(overview, tuple(drawn), session.trained - trained, handed)

@@ -10,10 +10,10 @@ from typing import Any
 
 import pyarrow
 
-from qrlsuite.api.arguments import several
 from qrlsuite.engine.status import EntryStatus
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import collect, fields
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.survey import STATUSES
 
@@ -84,9 +84,7 @@ def table(
     """
     if rows not in fields.FIELDS:
         raise OptionError(f"rows = {rows!r}: a row is one of the entries, seeds or epochs")
-    folder = Path(runs)
-    names = collect.task_names(folder, several(task), published)
-    found, left_out = collect.select(folder, names, entries, published, horizon)
+    found, left_out = collect.select(Selection.create(runs, task, published).named(), entries, horizon)
     for line in left_out:
         warnings.warn(f"left out: {line}", stacklevel=2)
     return fields.table(found, rows)
@@ -96,7 +94,7 @@ def progress_table(runs: Path, statuses: Sequence[EntryStatus]) -> list[dict[str
     """Return a row of values for each entry of a results folder: how far it is, and what `table` says of it."""
     results = {}
     if statuses:
-        found, _ = collect.collect(runs, {status.entry.task for status in statuses})
+        found, _ = collect.collect(Selection.create(runs, [status.entry.task for status in statuses]))
         results = {(row["task"], row["name"]): row for row in fields.table(found, "entries").to_pylist()}
     rows = []
     for status in statuses:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.api.evaluation import find, the_task
+from qrlsuite.api.evaluation import find_players
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.training import evaluation
 from qrlsuite.training.trainer import Trainer, build_envs
 
@@ -118,12 +118,9 @@ def _begins(given: Any, lanes: int) -> NDArray[np.bool_]:
     return begins.astype(np.bool_)
 
 
-def load(
-    runs: Path, entry: str, task: str | None = None, seed: int | None = None, published: bool = False
-) -> TrainedAgent:
+def load(written: Selection, entry: str, seed: int | None = None) -> TrainedAgent:
     """Return a trained agent of an entry: see `qrlsuite.api.agent`."""
-    on = None if task is None else the_task(runs, task, published)
-    store = find(runs, entry, None if on is None else on.name, published)
+    on, [store] = find_players(written, [entry])
     played = evaluation.trained_entry(store, on)
     [chosen], count = ([seed], 1) if seed is not None else evaluation.best_runs(store, 1)[::2]
     if chosen not in store.seeds():

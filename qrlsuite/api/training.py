@@ -15,6 +15,7 @@ from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.notation import Written
 from qrlsuite.options import Setting, from_mapping
@@ -378,9 +379,8 @@ def evaluate(
         raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
     names = [entries] if isinstance(entries, str) else list(entries)
     return evaluation.evaluate(
-        Path(runs),
+        Selection.create(runs, task, published),
         names,
-        task=task,
         best=best,
         episodes=episodes,
         seed=seed,
@@ -388,6 +388,5 @@ def evaluate(
         progress=progress,
         backend=backend,
         yes=yes,
-        published=published,
         perturb=[perturb] if isinstance(perturb, int | float) else list(perturb),
     )

@@ -11,6 +11,7 @@ from safetensors.numpy import save as encode
 from qrlsuite.api.evaluation import find
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import Arrays, EntryStore, write_atomically
 from qrlsuite.training import evaluation
@@ -38,7 +39,7 @@ def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None 
     OptionError
         If a seed has no agent, or the algorithm cannot begin with agents.
     """
-    source = find(runs, name, entry.task.name, published=True)
+    source = find(Selection(runs, True, (entry.task.name,)), name)
     agents, _, _ = evaluation.best_runs(source, max(1, len(source.seeds())))
     first = source.seed(agents[0])
     _require_fit(entry, agents[0], first.parameters(), first.agent)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,10 +24,10 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryResults]:
     """Three entries in place of a results folder."""
     found = [learner("ddqn mlp width=16", 40), learner("ddqn mlp width=64", 10), noisy("ddqn vqc qubits=6")]
 
-    def read(runs: Path, name: str, published: bool, tasks: Sequence[str]) -> list[EntryResults]:
+    def read(selection: collect.Selection, name: str) -> list[EntryResults]:
         return [next(entry for entry in found if name in entry.label)]
 
-    monkeypatch.setattr(collect, "collect", lambda runs, task=None, published=False, only=None: (found, []))
+    monkeypatch.setattr(collect, "collect", lambda selection: (found, []))
     monkeypatch.setattr(collect, "read_copies", read)
     return found
 

@@ -14,6 +14,7 @@ from qrlsuite import api
 from qrlsuite.api.evaluation import evaluate
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.training import deployment, evaluation
@@ -128,10 +129,14 @@ def test_a_device_that_is_no_simulator_needs_a_yes(trained: EntryStore, unreliab
     }  # fmt: skip
     unreliable.batches = 0
     with pytest.raises(OptionError, match=r"is no simulator: 1 agents.*80 circuits.*400 shots; add --yes"):
-        evaluate(runs, entry, **given)
+        evaluate(Selection(runs), entry, **given)
     assert unreliable.batches == 0  # nothing was executed
     unreliable.batches = 22
-    assert evaluate(runs, entry, **given, yes=True).policies[1].name.endswith("device=unreliable.qpu shots=5")
+    assert (
+        evaluate(Selection(runs), entry, **given, yes=True)
+        .policies[1]
+        .name.endswith("device=unreliable.qpu shots=5")
+    )
 
 
 STUDY = """
@@ -159,7 +164,7 @@ def test_a_study_executes_nothing_on_hardware(
 ) -> None:
     unreliable.batches = 0
     parsed = study.parse(STUDY.replace("TASK", tiny_task), "hardware.toml")
-    (drawn,) = studies.draw(parsed, parsed.members(), trained.path.parent.parent)
+    (drawn,) = studies.draw(parsed, parsed.members(), Selection(trained.path.parent.parent))
     assert (
         "device=unreliable.qpu shots=5 is no simulator: a study executes nothing on hardware" in drawn.problem
     )
@@ -205,7 +210,7 @@ def test_entries_without_circuits_or_agents_are_refused(kept: Train, trained: En
     for seed in (0, 1):
         (trained.path / f"seed-000{seed}" / "final.safetensors").unlink()
     with pytest.raises(StoreError, match="no trained parameters"):
-        evaluate(trained.path.parent.parent, [str(trained.path)], backend="qiskit", progress=False)
+        evaluate(Selection(trained.path.parent.parent), [str(trained.path)], backend="qiskit", progress=False)
 
 
 def test_the_command(trained: EntryStore) -> None:

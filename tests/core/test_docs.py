@@ -182,13 +182,13 @@ def test_published_entries_in_examples_exist(place: str, line: str) -> None:
     for name in [*filter(None, named), *([written] if isinstance(written, str) else written)]:
         if name.isupper():
             continue  # compare FIRST SECOND
-        assert collect.find(Path("none"), name, published=True, tasks=tasks)
+        assert collect.find(collect.Selection.create("none", tasks, published=True), name)
     named_studies = [
         values.get("name" if line.split()[1] == "study" else "study"),
         *(values.get("names") or ()),
     ]
     for study in [name for name in named_studies if name and not name.isupper()]:
-        assert studies.select(study, Path("none"), tasks, with_published=True)[0]
+        assert studies.select(study, collect.Selection.create("none", tasks, published=True))[0]
 
 
 def test_every_command_is_documented() -> None:

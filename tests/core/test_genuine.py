@@ -91,11 +91,11 @@ def test_entries_and_tasks_that_are_links_are_refused_and_the_results_folder_may
 ) -> None:
     runs = store.path.parents[1]
     (tmp_path / "root").symlink_to(runs)
-    (found,), refused = collect.collect(tmp_path / "root")
+    (found,), refused = collect.collect(collect.Selection(tmp_path / "root"))
     assert (found.seeds, refused) == ((0, 1, 2), [])
     (runs / "other").symlink_to(runs / "tiny")
     (runs / "tiny" / "again").symlink_to(store.path)
-    (found,), refused = collect.collect(runs)
+    (found,), refused = collect.collect(collect.Selection(runs))
     assert found.folder == store.path
     assert len(refused) == 3
     assert all("is a link" in line for line in refused)

@@ -457,7 +457,7 @@ def test_a_folder_of_two_codes_is_two_entries(kept: Train, tmp_path: Path) -> No
     other = identity.CodeIdentity((*parts[:2], {**parts[2], "numerics": 3}))
     for seed in (1, 3):
         edit_json(store.seed(seed).path / "run.json", code=other.record())
-    found, refused = collect.collect(tmp_path / "runs")
+    found, refused = collect.collect(collect.Selection(tmp_path / "runs"))
     first = read_json(folder / "seed-0000" / "run.json")["code"]["digest"]
     assert not refused
     assert {entry.label: entry.seeds for entry in found} == {
@@ -467,9 +467,12 @@ def test_a_folder_of_two_codes_is_two_entries(kept: Train, tmp_path: Path) -> No
     with pytest.raises(
         UnknownNameError, match=f"write 'ddqn mlp width=16 @{first[:8]}', 'ddqn mlp width=16 @"
     ):
-        collect.find(tmp_path / "runs", "mlp")
-    assert collect.find(tmp_path / "runs", f"mlp width=16 @{other.digest[:4]}").seeds == (1, 3)
-    assert collect.find(tmp_path / "runs", f"{folder}@{first[:8]}").seeds == (0, 2)
+        collect.find(collect.Selection(tmp_path / "runs"), "mlp")
+    assert collect.find(collect.Selection(tmp_path / "runs"), f"mlp width=16 @{other.digest[:4]}").seeds == (
+        1,
+        3,
+    )
+    assert collect.find(collect.Selection(tmp_path / "runs"), f"{folder}@{first[:8]}").seeds == (0, 2)
     with pytest.raises(StoreError, match="several entries"):
         collect.read(store)
 
@@ -583,7 +586,7 @@ def test_a_damaged_identity_is_named(kept: Train, tmp_path: Path, code: Any) -> 
     edit_json(folder / "seed-0001" / "run.json", code=code)
     with pytest.raises(QrlSuiteError, match=r"seed-0001/run\.json: code is not a code identity"):
         codes.of_seeds(EntryStore(folder))
-    assert "code is not a code identity" in "".join(collect.collect(tmp_path / "runs")[1])
+    assert "code is not a code identity" in "".join(collect.collect(collect.Selection(tmp_path / "runs"))[1])
 
 
 SAMPLE = b'''"""Of every kind of syntax that versions of Python have changed, or might."""

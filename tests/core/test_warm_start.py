@@ -97,10 +97,10 @@ def test_from_python_it_is_the_same_entry(root: Path) -> None:
 def test_names_mean_the_cold_entry_or_the_warm_one(root: Path) -> None:
     _, warm = stores(root)
     cold = trainer(str(root / "other.toml"), root)("runs", [0], 1)
-    assert collect.find(root / "runs", "mlp width=16", tasks=["other"]).folder == cold
-    assert collect.find(root / "runs", warm.entry().label).folder == warm.path
+    assert collect.find(collect.Selection(root / "runs", tasks=("other",)), "mlp width=16").folder == cold
+    assert collect.find(collect.Selection(root / "runs"), warm.entry().label).folder == warm.path
     text = warm.entry().start
-    found = collect.find(root / "runs", f"other/mlp from={text} width=16")
+    found = collect.find(collect.Selection(root / "runs"), f"other/mlp from={text} width=16")
     assert found.folder == warm.path
     (note,) = tables.unlike_others([found])
     assert note.startswith("warm-started, ")

@@ -23,7 +23,7 @@ import torch
 from qrlsuite import registry
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import load
-from qrlsuite.leaderboard.shelf.collect import collect
+from qrlsuite.leaderboard.shelf.collect import Selection, collect
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, entries, learning_curve
 from qrlsuite_released import entries as imports
@@ -322,7 +322,7 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
     again = say(*words)
     assert "3 of 3 files were imported before" in again.output
 
-    (found,), refused = collect(tmp_path / "runs")
+    (found,), refused = collect(Selection(tmp_path / "runs"))
     assert refused == []
     assert found.label == "ddqn hybrid (imported)"
     assert found.parameters == (16, 15)

@@ -148,7 +148,7 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
                 path.write_text(json.dumps(record))
 
     def told() -> tuple[dict[str, int], str, str]:
-        made = board.build(collect.collect(tmp_path / "runs")[0])
+        made = board.build(collect.collect(collect.Selection(tmp_path / "runs"))[0])
         rows = made.as_dict()["sections"][0]["rows"]
         counts = {row["label"].split()[0]: row["parameters"]["classical"] for row in rows}
         return counts, markdown(made), report.render(made)
@@ -170,7 +170,7 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
     ppo = collect.read_entry(stores["ppo"])
     assert ppo is not None
     export(ppo, tmp_path / "old")
-    (old,) = collect.collect(tmp_path / "old")[0]
+    (old,) = collect.collect(collect.Selection(tmp_path / "old"))[0]
     assert (old.parameters, old.networks) == ((387, 0), None)
 
 

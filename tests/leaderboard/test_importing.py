@@ -52,7 +52,7 @@ def elsewhere(task: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(elsewhere: Path) -> Path:
     out = elsewhere.parent / "entries"
-    (found,), _ = collect.collect(elsewhere)
+    (found,), _ = collect.collect(collect.Selection(elsewhere))
     return export(found, out)
 
 
@@ -103,15 +103,15 @@ def test_an_exported_entry_counts_with_the_same_curves(
     (source,) = import_seeds.sources(elsewhere)
     for s in (0, 1):
         assert done.store.seed(s).agent.read_bytes() == source.seed(s).agent.read_bytes()
-    (here,), _ = collect.collect(runs)
-    (there,), _ = collect.collect(elsewhere)
+    (here,), _ = collect.collect(collect.Selection(runs))
+    (there,), _ = collect.collect(collect.Selection(elsewhere))
     assert np.array_equal(here.curves, there.curves)
     assert here.hours == pytest.approx(there.hours)
     for name in ("seeds", "label", "tuning", "parameters", "versions"):
         assert getattr(here, name) == getattr(there, name)
     assert plan_groups(done.store, range(2), 2, 1) == []
     train_group(done.store.path, [2], 2)
-    (more,), _ = collect.collect(runs)
+    (more,), _ = collect.collect(collect.Selection(runs))
     assert more.seeds == (0, 1, 2)
     with pytest.raises(StoreError, match="cannot be extended"):
         train_group(done.store.path, [0], 3)
@@ -152,7 +152,7 @@ def test_stopped_anywhere_it_goes_on(
     assert not list(store.path.glob(".seed*"))
     if kind == "runs":
         assert set(checkpoint.latest(store)) == {0, 1}
-    (here,), _ = collect.collect(runs)
+    (here,), _ = collect.collect(collect.Selection(runs))
     assert here.seeds == (0, 1)
 
 

@@ -135,7 +135,7 @@ def test_an_export_holds_metrics_which_are_checked(walked: tuple[Path, EntryResu
         np.testing.assert_array_equal(read.metrics[name], values)
     assert verify.verify(folder, rerun=2, choice=1).ok
     import_seeds.import_seeds(EntryStore(folder), tmp_path / "runs")
-    [again], _ = collect.select(tmp_path / "runs")
+    [again], _ = collect.select(collect.Selection(tmp_path / "runs"))
     np.testing.assert_array_equal(again.metrics["late"], entry.metrics["late"])
 
     table = pyarrow.parquet.read_table(folder / published.CURVES)
@@ -212,7 +212,7 @@ def test_curves_of_other_programs_may_be_costs(tmp_path: Path) -> None:
     (tmp_path / "curves.csv").write_text("\n".join(["entry,seed,step,Regret", *lines]))
     asked = {"metric": "Regret", "goal": "below", "thresholds": [7, 8.5], "runs": tmp_path}
     done = api.import_curves(tmp_path / "curves.csv", **asked)
-    file = collect.find(tmp_path, "a").task_file
+    file = collect.find(collect.Selection(tmp_path), "a").task_file
     assert (file.score.metric, file.score.goal, file.ranking.cell) == (
         "regret",
         "below",

@@ -92,8 +92,8 @@ SAME = [
 
 
 def test_what_is_published_is_what_was_run(trained: Path) -> None:
-    (one,), refused = collect.collect(trained / "runs")
-    (other,), refused_there = collect.collect(trained / "entries")
+    (one,), refused = collect.collect(collect.Selection(trained / "runs"))
+    (other,), refused_there = collect.collect(collect.Selection(trained / "entries"))
     assert refused == refused_there == []
     assert np.array_equal(one.curves, other.curves)
     assert other.source == "published"
@@ -181,7 +181,7 @@ def test_wrong_curves_are_refused(folder: Path, tmp_path: Path, case: str) -> No
     rewrite(folder / "curves.parquet", change)
     with pytest.raises(StoreError, match=str(message)):
         published.read(folder)
-    assert len(collect.collect(tmp_path / "entries")[1]) == 1
+    assert len(collect.collect(collect.Selection(tmp_path / "entries"))[1]) == 1
 
 
 def rehash(record: dict[str, Any]) -> None:
@@ -235,12 +235,12 @@ def test_truncated_and_missing_files_are_refused_and_the_rest_is_ranked(
     shutil.copytree(folder, bad)
     content = (bad / name).read_bytes()
     (bad / name).write_bytes(content[: len(content) // 2])
-    (entry,), (refused,) = collect.collect(tmp_path / "entries")
+    (entry,), (refused,) = collect.collect(collect.Selection(tmp_path / "entries"))
     assert entry.folder == folder
     assert "ffffffff" in refused
     (bad / name).unlink()
     if name == "seeds.parquet":
-        assert "seeds.parquet is missing" in collect.collect(tmp_path / "entries")[1][0]
+        assert "seeds.parquet is missing" in collect.collect(collect.Selection(tmp_path / "entries"))[1][0]
 
 
 def test_a_table_that_unpacks_to_too_much_is_not_unpacked(folder: Path) -> None:
@@ -321,7 +321,7 @@ def test_records_from_before_devices_and_plugins_were_recorded_keep_their_bits(f
     edit(folder, older)
     verdict = verify.verify(folder, rerun=1)
     assert (verdict.ok, verdict.check) == (True, "verified"), verdict.message
-    assert not collect.collect(folder.parent.parent)[0][0].mixed_versions
+    assert not collect.collect(collect.Selection(folder.parent.parent))[0][0].mixed_versions
 
 
 def test_curves_of_other_numerics_are_those_of_another_version(folder: Path) -> None:
@@ -352,7 +352,7 @@ def test_epochs_of_a_gpu_are_those_of_another_machine(cpu: int, runs: Path, tmp_
         gpu = {**last, "device": {"kind": "cuda", "name": "NVIDIA H100"}}
         path.write_text(json.dumps({**record, "provenance": [gpu, *[last] * cpu]}))
     again = publish(runs, tmp_path / "again")
-    (found,), _ = collect.collect(tmp_path / "again")
+    (found,), _ = collect.collect(collect.Selection(tmp_path / "again"))
     assert found.devices == (("cpu", "cuda") if cpu else ("cuda",))
     rewrite(again / "curves.parquet", lambda c: c.update(score=[s - 1e-6 for s in c["score"]]))
     verdict = verify.verify(again, rerun=1)
@@ -469,7 +469,7 @@ def test_seeds_that_may_have_been_chosen_are_not_ranked(folder: Path, tmp_path: 
     assert not found.sections
     assert "its 8 seeds are not 0 to 7 (3 is missing): not ranked" in found.refused[0]
     assert "not ranked" in verify.verify(folder).message
-    (entry,), _ = collect.collect(tmp_path / "entries")
+    (entry,), _ = collect.collect(collect.Selection(tmp_path / "entries"))
     with pytest.raises(QrlSuiteError, match="3 is missing"):
         compare_entries(entry, entry)
 
@@ -583,7 +583,7 @@ def test_own_runs_of_a_published_entry_are_shown_once(
 ) -> None:
     monkeypatch.setattr(published, "PUBLISHED", tmp_path / "entries")
     train("mine", range(2), EPOCHS)
-    entries, refused = collect.collect(tmp_path / "mine", published=True)
+    entries, refused = collect.collect(collect.Selection(tmp_path / "mine", published=True))
     assert [len(entry.seeds) for entry in entries] == [8]
     assert "2 seeds of 3 epochs; shown are 8 seeds of 3 epochs of the same entry, from" in refused[0]
     other = dataclasses.replace(entries[0], name="another", folder=tmp_path)
@@ -600,16 +600,16 @@ def test_own_runs_of_a_published_entry_are_shown_once(
         first, dataclasses.replace(second, environments=frozenset("c"))
     )
     train("short", range(9), 1)
-    entries, refused = collect.collect(tmp_path / "short", published=True)
+    entries, refused = collect.collect(collect.Selection(tmp_path / "short", published=True))
     assert [(entry.curves.shape, "(published)" in entry.label) for entry in entries] == [
         ((9, 1), False),
         ((8, 3), True),
     ], "an own entry that is shorter stands beside the published one"
     only = {("tiny", entries[0].name), ("tiny", "another")}
-    asked, refused = collect.collect(tmp_path / "short", published=True, only=only)
+    asked, refused = collect.collect(collect.Selection(tmp_path / "short", published=True, only=only))
     assert [entry.label for entry in asked] == [entry.label for entry in entries], "of a study, too"
     assert refused == ["1 of the study's 2 entries: nothing is trained yet"]
-    assert len(collect.collect(tmp_path / "nothing", published=True)[0]) == 1
+    assert len(collect.collect(collect.Selection(tmp_path / "nothing", published=True))[0]) == 1
 
 
 def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(
@@ -732,5 +732,5 @@ def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> No
 def test_published_entries_play_no_episodes(two: str, tmp_path: Path) -> None:
     text = Path(two).read_text().replace('kind = "bars"', 'kind = "histogram"\nevaluation = { best = 1 }')
     study = parse(text, "two.toml")
-    (drawn,) = studies.draw(study, study.members(), tmp_path, with_published=True)
+    (drawn,) = studies.draw(study, study.members(), collect.Selection(tmp_path, published=True))
     assert drawn.problem == "nothing is trained yet", "agents are not published"

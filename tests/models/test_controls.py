@@ -16,7 +16,7 @@ from qrlsuite.circuit import Circuit, ansatz
 from qrlsuite.circuit.resources import jacobian_rank
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.leaderboard.shelf.collect import collect
+from qrlsuite.leaderboard.shelf.collect import Selection, collect
 from qrlsuite.options import parse_setting
 from qrlsuite.plugins.circuits.ansatz import NoOptions
 from qrlsuite.plugins.models.tmlp import contracted
@@ -185,7 +185,7 @@ def agent_of(folder: Path, model: str) -> nn.Module:
 def test_boards_tell_fixed_numbers_apart(train: Train, tmp_path: Path) -> None:
     train("board", [0], 2, model="fourier", settings=("frequencies=5", "train=linear"))
     train("board", [0], 2, settings=("width=4",))
-    found = {e.model: e for e in collect(tmp_path / "board")[0]}
+    found = {e.model: e for e in collect(Selection(tmp_path / "board"))[0]}
     assert (found["fourier"].parameters, found["fourier"].fixed) == ((33, 0), 15)
     assert found["fourier"].facts["parameters"] == "33 (15 fixed)"
     assert found["mlp"].fixed == 0

@@ -12,6 +12,7 @@ from qrlsuite.api import evaluation
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, entries_here, names_of
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import write_atomically
 
 
@@ -95,16 +96,14 @@ def evaluate(
     """
     format_ = pictures.format_of(out)
     evaluations = evaluation.evaluate(
-        runs,
+        Selection.create(runs, task, published),
         entries or (),
-        task=task,
         best=best,
         episodes=episodes,
         seed=seed,
         progress=not json_output,
         backend=backend,
         yes=yes,
-        published=published,
         perturb=perturb or (),
     )
     if out is not None:

@@ -26,6 +26,7 @@ from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard.boards.board import AXES
 from qrlsuite.leaderboard.boards.times import ALPHA
+from qrlsuite.leaderboard.shelf.collect import Selection
 
 
 class Format(StrEnum):
@@ -113,8 +114,6 @@ def leaderboard(
 
     asked: dict[str, Any] = {
         "by": by,
-        "runs": runs,
-        "published": published,
         "study": study,
         "rule": rule,
         "alpha": alpha,
@@ -122,13 +121,13 @@ def leaderboard(
         "entries": entry or (),
     }
     if format_ is Format.html:
-        path, refused = write_page(output, tasks, **asked)
+        path, refused = write_page(output, Selection.create(runs, tasks, published), **asked)
         _left_out(refused)
         if path is None:
             raise _nothing(runs, tasks)
         typer.echo(f"wrote {path}")
         return
-    board = api.board(tasks, **asked)
+    board = api.board(tasks, runs=runs, published=published, **asked)
     if format_ is Format.json:
         typer.echo(json.dumps(board.as_dict()))
         return

@@ -9,6 +9,7 @@ import typer
 
 from qrlsuite.api import episode as episodes
 from qrlsuite.cli.arguments import PublishedOption, RunsOption, entries_here, names_of
+from qrlsuite.leaderboard.shelf.collect import Selection
 
 
 def play(
@@ -47,7 +48,7 @@ def play(
     Example: qrlsuite play "vqc-native qubits=6" --task beam6g --published --out circuit.gif
     """
     episodes.check_ending(out)
-    shown = episodes.record(runs, entry, task, episode, seed, published)
+    shown = episodes.record(Selection.create(runs, task, published), entry, episode, seed)
     typer.echo(str(shown))
     shown.save(out)
     typer.echo(f"wrote {out} ({len(shown.frames)} frames, {out.stat().st_size / 1e6:.1f} MB)")

@@ -20,6 +20,7 @@ from qrlsuite.cli.arguments import (
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.pictures.compose import compose, summaries
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import write_atomically
 
 
@@ -81,12 +82,10 @@ def plot(
     picture_settings, environment_settings = _split(settings or [])
     drawn = compose(
         kind,
-        task or [],
+        Selection.create(runs, task, published),
         entry or [],
         horizon=horizon,
         seeds=seeds,
-        runs=runs,
-        published=published,
         settings=picture_settings,
         environment=environment_settings,
     )

@@ -13,7 +13,8 @@ from qrlsuite.cli.arguments import PublishedOption, RunsOption, TaskOption
 from qrlsuite.engine.status import survey
 from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.report.live import Live, Server, serve
-from qrlsuite.leaderboard.shelf import collect, published_studies
+from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.leaderboard.shelf.collect import Selection
 
 
 def view(
@@ -33,18 +34,19 @@ def view(
 
     Example: qrlsuite view
     """
-    tasks = collect.task_names(runs, [task] if task else [], published)
+    selection = Selection.create(runs, task, published).named()
 
     def render() -> str:
         board = api.board(task, runs=runs, published=published)
-        studies, unreadable = published_studies.collected(runs, tasks, published)
+        studies, unreadable = published_studies.collected(selection)
         shown = replace(board, refused=(*board.refused, *unreadable))
         return report.render(shown, studies=studies, live=True)
 
     with Server(port) as server:
         typer.echo(f"reading {runs} ...")
         live = Live(
-            render, lambda: survey(runs, next(iter(tasks), None)) if runs.is_dir() or not published else []
+            render,
+            lambda: survey(runs, next(iter(selection.tasks), None)) if runs.is_dir() or not published else [],
         )
         typer.echo(f"{runs} is shown to browsers on this machine, until Ctrl-C, at {server.address}")
         serve(server, live)
