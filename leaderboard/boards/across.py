@@ -71,7 +71,7 @@ class AcrossSection:
 
     @property
     def title(self) -> str:
-        """What is compared."""
+        """The title: tasks with their horizons, and the unit."""
         parts = (
             f"{task} ({steps_text(horizon)} steps)"
             for task, horizon in zip(self.shares.tasks, self.shares.horizons)
@@ -199,7 +199,7 @@ class AcrossSection:
 def collected(
     tasks: Sequence[str], select: Callable[[str], tuple[list[EntryResults], list[str]]]
 ) -> tuple[list[EntryResults], list[str]]:
-    """Read the entries of several tasks, every one of which must have some; `select` reads one task's."""
+    """Read the entries of several tasks with `select`, one task at a time; a task without entries is an error."""
     if len(set(tasks)) < len(tasks):
         twice = next(task for task in tasks if tasks.count(task) > 1)
         raise OptionError(f"--task: {twice} is named twice")
@@ -227,7 +227,7 @@ def shares(
     Parameters
     ----------
     entries:
-        Of these tasks; those that their own board leaves out have no row.
+        Entries of these tasks. An entry that its task's board leaves out has no row.
     tasks:
         In the order of the result.
     horizon:

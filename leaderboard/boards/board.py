@@ -1,6 +1,6 @@
-"""Leaderboards: rows are entries, the axis is steps, what they cost or a score, task by task or over several tasks.
+"""Leaderboards: one row per entry, ranked by steps, costs or scores, on one task or over several.
 
-`build` makes them all; each kind of section is a module of its own.
+`build` makes every board. Each kind of section has its own module.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from qrlsuite.statistics import SignificanceRule
 from qrlsuite.statistics.times import check_probability
 
 AXES = ("steps", *costs.UNITS, *scores.OF_RUNS)
-"""What entries may be ranked by."""
+"""The axes of every board."""
 
 
 def axes_of(entries: Sequence[EntryResults]) -> tuple[str, ...]:
-    """Return what entries may be ranked by: `AXES`, and the costs that a task of theirs names."""
+    """Return the axes that rank these entries: `AXES`, and the costs that their tasks name."""
     named = {name for entry in entries for name in entry.task_file.ranking.costs}
     return (*AXES, *sorted(named - set(AXES)))
 
@@ -48,7 +48,7 @@ class Section(Protocol):
 
 @dataclass(frozen=True, repr=False)
 class Leaderboard(Shown):
-    """All sections by one axis, and what was refused and why. It shows itself as a table per task."""
+    """All sections by one axis, and the refused entries with reasons. It shows itself as a table per task."""
 
     sections: tuple[Any, ...]
     refused: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ class Leaderboard(Shown):
 
     @property
     def promise(self) -> str:
-        """What they control, joined by semicolons."""
+        """The promises of all rules, joined by semicolons."""
         return "; ".join(self.rules.values())
 
     def as_dict(self) -> dict[str, Any]:
@@ -80,7 +80,7 @@ class Leaderboard(Shown):
         return [row for section in self.sections for row in section.flat()]
 
     def sheets(self, explain: bool = False) -> list[Sheet]:
-        """Return a table per task; `explain` adds what its columns and marks mean, and the matrix of its pairs."""
+        """Return a table per task; `explain` adds the meanings of columns and marks, and the matrix of pairs."""
         if all(isinstance(section, steps.Section) for section in self.sections):
             return tables.sheets(self.sections, explain)
         return [section.sheet(explain) for section in self.sections]
@@ -104,27 +104,27 @@ def build(
 ) -> Leaderboard:
     """Rank entries, task by task, or over several tasks.
 
-    Entries of one task that were made under another definition of it are refused: the majority's stands, unless
-    `definitions` says which. So are those of a study with looks, whose number of seeds depends on what they showed.
+    An entry is refused if its task had another definition than most entries have, or than `definitions` names. An
+    entry of a study with looks is refused, too: its number of seeds depends on its results.
 
     Parameters
     ----------
     entries:
         Of any tasks.
     refused:
-        Lines about what could not be read, passed on.
+        Lines about unreadable entries; they are passed on.
     rule:
-        By which tiers are judged, see `qrlsuite.leaderboard.rules.load`; None means each task's own, the paper's
-        where it names none. Tables show tiers where a rule other than `times` is given or named.
+        The rule of tiers, see `qrlsuite.leaderboard.rules.load`. None means each task's own rule, or the paper's if the
+        task names none. Tables show tiers if a rule other than `times` is given or named.
     horizon:
         Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
     alpha:
         Error probability of the whole board, see `qrlsuite.leaderboard.boards.times.rank_by_time`.
     shown:
-        Which entries have a row. All are compared: what is shown changes no verdict. None means all. By cost all have
-        one, for the cheapest sets the budget of the others.
+        Selects the entries that have a row; None means all. All entries are compared: a hidden row changes no verdict.
+        By cost every entry has a row, since the cheapest sets the budget of the others.
     by:
-        One of `axes_of`: of `AXES`, or what the task's `[ranking] costs` names.
+        One of `axes_of(entries)`: one of `AXES`, or a name in the task's `[ranking] costs`.
     together:
         Tasks over which the means of entries are compared, in one section.
     definitions:

@@ -29,15 +29,15 @@ class EntryComparison(Shown, Comparison):
     Attributes
     ----------
     labels:
-        What the two entries are called.
+        Names of the two entries.
     pair:
         The verdict by steps below threshold, and the final scores.
     remarks:
-        What may flatter one of them.
+        Facts that may flatter one of the entries.
     show_cells:
         Whether the cells are shown one by one: a rule was asked for.
     among:
-        The same pair on the board of its task; None where it was not looked for, or there is no other entry.
+        The pair's verdict on its task's board; None if it was not looked up, or the board has no other entry.
     """
 
     labels: tuple[str, str]
@@ -60,19 +60,19 @@ class EntryComparison(Shown, Comparison):
 
     @property
     def cells_line(self) -> str:
-        """What the rule for cells of the sample-complexity surface says."""
+        """The verdict of the rule for cells of the sample-complexity surface."""
         rule = "the paper's rule" if self.rule == DEFAULT else f"rule '{self.rule}'"
         return f"by {rule}, cell by cell: {self.sentence}"
 
     @property
     def further(self) -> list[str]:
-        """What follows the table of thresholds, line by line."""
+        """The lines below the table of thresholds."""
         board = self.among.text if self.among is not None else ""
         return [line for line in (board, self.pair.final, self.cells_line, *self.remarks) if line]
 
     @property
     def legend(self) -> str:
-        """What the signs in the table of cells mean."""
+        """Meanings of the signs in the table of cells."""
         return legend(self)
 
     def as_dict(self) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def compare_entries(
     first, second:
         The entries.
     rule:
-        What counts as significant in a cell; None means the task's own, the paper's where it names none.
+        Decides what is significant in a cell; None means the task's rule, or the paper's if the task names none.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(
@@ -146,7 +146,7 @@ SYMBOLS = {
     "both-at-cap": ("^", "dim", "both at the cap"),
     "undecided": ("?", "yellow", "undecided"),
 }
-"""What a cell of a comparison looks like; the sign says everything, the color only helps."""
+"""Sign, color and meaning of each outcome of a cell; the sign alone is enough."""
 
 
 LONGEST_WORD = 14
@@ -177,7 +177,7 @@ def pair_table(pair: PairVerdict) -> Table:
 
 
 def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
-    """Return what the rows of a comparison's grid are, their levels, and the deltas across."""
+    """Return the title of a comparison's grid, its levels (rows), and its deltas (columns)."""
     grid = comparison.grid
     rows = [f"{float(level):g}" for level in grid.levels]
     return f"{grid.level_name} down, delta across", rows, [f"{float(delta):g}" for delta in grid.deltas]

@@ -1,10 +1,9 @@
-"""Boards by what learning costs: circuit executions, shots or core-hours in the place of environment steps.
+"""Boards by the costs of learning: circuit executions, shots or core-hours instead of environment steps.
 
-Every entry's own record says what its steps cost: all that its seeds took, divided by all their steps. With it,
-its learning curves are read along the cost instead of the steps. Entries are compared within one budget, what the
-cheapest of them spent in all: a step limit would give an entry with cheap steps a lower cap than the others, and an
-entry that never learns could be first. Where a record does not hold what a comparison needs, an entry has no rank,
-and the board says why.
+The price of an entry's step is the total cost of its seeds, as recorded, divided by all their steps. With that price,
+learning curves are read along the cost instead of the steps. All entries are compared within one budget, the total
+cost of the cheapest: a step limit would give an entry with cheap steps a lower cap than the others, and an entry that
+never learns could be first. An entry whose record lacks a needed number has no rank, and the board says why.
 """
 
 from __future__ import annotations
@@ -31,21 +30,21 @@ from qrlsuite.statistics.compare import TOO_FEW
 CELLS = 1000
 """Parts of the budget at which curves are read where the epochs of entries cost differently."""
 UNEVEN = 1.05
-"""Ratio of the costs of a step of two seeds beyond which it is said that they differ."""
+"""The board reports that seeds differ in price if the ratio of two prices is larger than this."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What is counted in the place of environment steps.
+    """A unit that is counted instead of environment steps.
 
     Attributes
     ----------
     text:
-        Writes a number of them.
+        Writes a number of this unit.
     step_text:
-        Writes what one step costs.
+        Writes the price of one step.
     meaning:
-        What is counted, in a sentence.
+        The unit in a sentence.
     """
 
     name: str
@@ -82,16 +81,16 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Price:
-    """What an environment step of an entry costs.
+    """The price of an entry's environment step.
 
     Attributes
     ----------
     per_step:
         Mean over its seeds; NaN where its record does not say.
     problem:
-        Why the entry cannot be compared by it; empty where it can.
+        Why the entry cannot be compared by this price; empty if it can.
     spread:
-        The largest of its seeds' costs of a step over the smallest; 1 where all are equal.
+        The highest price of a seed's step over the lowest; 1 if all are equal.
     """
 
     per_step: float
@@ -100,12 +99,12 @@ class Price:
 
 
 def price(entry: EntryResults, unit: str) -> Price:
-    """Return what an entry's environment step costs, by its record.
+    """Return the price of an entry's environment step, by its record.
 
     Parameters
     ----------
     unit:
-        A key of `UNITS`, or `steps`, of which every step is one.
+        A key of `UNITS`, or `steps` (a price of 1).
     """
     if unit == "steps":
         return Price(1.0)
@@ -134,7 +133,7 @@ def price(entry: EntryResults, unit: str) -> Price:
 
 
 def _untimed(entry: EntryResults) -> str:
-    """Say why an entry's hours are not processor time of one kind of processor; empty where they are."""
+    """Return why an entry's hours are not processor time of one kind of processor; empty if they are."""
     if entry.clocked is None:
         return "its record does not say whether its hours are processor time or by the clock"
     if entry.clocked:
@@ -169,11 +168,11 @@ class CostSection:
     Attributes
     ----------
     rows:
-        In the order of M, those that are not compared last.
+        In the order of M; entries without a rank last.
     compared:
-        All pairs of the others, along the cost in parts of the budget; None where there are none.
+        All pairs of ranked entries, along the cost in parts of the budget; None if there are none.
     budget:
-        What all of these have spent in all, at least.
+        The total cost of the cheapest ranked entry.
     part:
         Cost of one part.
     exact:
@@ -194,7 +193,7 @@ class CostSection:
 
     @property
     def title(self) -> str:
-        """What is compared."""
+        """The title: task, unit, budget and cell."""
         within = f", within {self.unit.text(self.budget)}" if self.compared is not None else ""
         return f"{self.task} by {self.unit.name}{within}, sample complexity at {self.cell}"
 
@@ -234,7 +233,7 @@ class CostSection:
         )
 
     def priced(self, row: CostRow) -> bool:
-        """Whether the record says what a step costs."""
+        """Whether the record has the price of a step."""
         return not math.isnan(row.price.per_step)
 
     def marked(self, row: CostRow) -> bool:
@@ -260,7 +259,7 @@ class CostSection:
         return None if self.compared is None or row.index is None else self.compared.means[row.index]
 
     def against(self, row: CostRow, direction: Direction) -> list[str]:
-        """Return the labels of the entries of which a decided pair says that this one needs less, or more."""
+        """Return the labels of the entries than which this one needs less (or more), by decided pairs."""
         if self.compared is None or row.index is None:
             return []
         directions = self.compared.directions[row.index]
@@ -371,13 +370,13 @@ def sections(
     by: str,
     alpha: float = ALPHA,
 ) -> tuple[list[CostSection], list[str]]:
-    """Rank the entries of a task by what learning costs; arguments as for `qrlsuite.leaderboard.boards.board.build`.
+    """Rank the entries of a task by their costs of learning; arguments as for `boards.board.build`.
 
     Returns
     -------
     tuple
-        The section; and one line for each entry that was left out. Those that do not reach the task's shortest
-        horizon, where others do, are.
+        The section; and one line for each entry that was left out: if some entries reach the task's shortest horizon,
+        the shorter ones are left out.
     """
     paid = {id(entry): price for entry, price in zip(entries, prices(entries, UNITS[by].name))}
     payable = [entry for entry in entries if not paid[id(entry)].problem]
@@ -427,13 +426,13 @@ def prices(entries: Sequence[EntryResults], unit: str) -> list[Price]:
 def along(
     entries: Sequence[EntryResults], per_step: Sequence[float]
 ) -> tuple[float, float, bool, list[LearningCurves]]:
-    """Return curves along the cost, for entries whose steps have these costs.
+    """Return the entries' curves along the cost, given the prices of their steps.
 
     Returns
     -------
     tuple
-        What the cheapest entry spent in all: the budget of each; the cost of one of its equal parts; whether these are
-        the epochs, which cost the same for all; and the curves, an epoch for each part.
+        The budget (the total cost of the cheapest entry); the cost of one of its equal parts; whether the parts are the
+        epochs, at one price for all; and the curves, an epoch for each part.
     """
     costs = [price * entry.steps_per_epoch for price, entry in zip(per_step, entries)]
     budget = min(cost * entry.curves.shape[1] for cost, entry in zip(costs, entries))

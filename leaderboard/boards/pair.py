@@ -68,21 +68,21 @@ class PairVerdict:
     Attributes
     ----------
     labels:
-        What the two entries are called, without the algorithm where it is the same.
+        Labels of the two entries, without the algorithm if they share it.
     times:
         The verdict and every threshold.
     thresholds:
-        The grid's, in units of the score.
+        Thresholds of the grid, in units of the score.
     scores:
-        Both by their final scores; None where one has a single run.
+        The comparison by final scores; None if an entry has a single run.
     n_last:
-        Epochs of the first that its final score is the mean of.
+        Number of epochs in the first entry's final score, a mean.
     adjusted:
-        Whether the verdict and p are those of a board, adjusted for all of its pairs.
+        Whether verdict and p are a board's, adjusted for all of its pairs.
     whole:
         Environment steps at which the task's first board ranks.
     score_name:
-        What the final score is called: `score`, or the metric's name.
+        Name of the final score: `score`, or the metric's name.
     before:
         The side of a threshold where a run has not reached it: `below`, or `above`.
     """
@@ -129,7 +129,7 @@ class PairVerdict:
         return self._decided(pair.direction is Direction.FEWER)
 
     def _decided(self, first_wins: bool) -> str:
-        """Say who needs fewer steps, and where the mean does not show it, at which threshold."""
+        """Name the entry that needs fewer steps and, if the mean does not show it, the thresholds that do."""
         winner, loser = self.labels if first_wins else self.labels[::-1]
         mean = fewer(self.times.difference, first_wins)
         if mean[1] > 0:
@@ -166,7 +166,7 @@ class PairVerdict:
     def _at(self, sign: int) -> str:
         """Name the thresholds at which the first (1) or the second (-1) needs significantly fewer steps, and its share.
 
-        Where none is significant at the level of a sign, the verdict rests on the one with the smallest p.
+        If no threshold is significant at the level of a sign, the verdict rests on the threshold with the smallest p.
         """
         chosen = np.flatnonzero(self.times.signs == sign)
         places = chosen if len(chosen) else [int(self.times.p_each.argmin())]
@@ -205,7 +205,7 @@ class PairVerdict:
 
     @property
     def notes(self) -> list[str]:
-        """What the table means."""
+        """The notes below the table."""
         return [
             f"steps {self.before} threshold: mean over seeds; a seed that never reaches it counts with "
             f"{steps_text(self.times.horizon)}",
@@ -282,7 +282,7 @@ def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: flo
 
 
 def _short(first: EntryResults, second: EntryResults) -> tuple[str, str]:
-    """Return both labels, without the algorithm where it is the same."""
+    """Return both labels, without the algorithm if they share it."""
     if first.algorithm != second.algorithm:
         return first.label, second.label
     prefix = f"{first.algorithm} "
@@ -292,18 +292,18 @@ def _short(first: EntryResults, second: EntryResults) -> tuple[str, str]:
 def on_board(
     first: EntryResults, second: EntryResults, entries: Sequence[EntryResults], grid: Grid, alpha: float
 ) -> OnBoard | None:
-    """Return what the pair comes to on the board of its task at its horizon.
+    """Return the pair's verdict on its task's board, at the pair's horizon.
 
     Parameters
     ----------
     entries:
-        Those of the task. Entries of a study with looks, of another definition of the task, shorter than the pair or
-        with fewer than 20 seeds are not ranked.
+        Entries of the task. An entry of a study with looks, of another definition of the task, shorter than the pair
+        or with fewer than 20 seeds is not ranked.
 
     Returns
     -------
     OnBoard or None
-        None where one of the two is not ranked, or no other is.
+        None if one of the two is not ranked, or no other entry is.
     """
     end = min(each.curves.shape[1] * each.steps_per_epoch for each in (first, second))
     ranked = []
@@ -326,14 +326,14 @@ def on_board(
 def pair_on(
     ranking: TimeRanking, first: TimeRow, second: TimeRow, grid: Grid, labels: tuple[str, str]
 ) -> PairVerdict:
-    """Return two rows of a board as the board judges them: nothing is tested anew.
+    """Return the board's verdict on two of its rows; nothing is tested anew.
 
     Parameters
     ----------
     grid:
-        The board's.
+        The grid of the board.
     labels:
-        What the verdict calls the two.
+        Names of the two in the verdict.
     """
     board = ranking.board
     rows = first, second
@@ -363,12 +363,12 @@ def pair_on(
 
 
 def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:
-    """Return how many fewer steps the first needs than the second, or the second than the first: share, low, high.
+    """Return the share of steps that the first saves against the second (or the reverse): mean, low, high.
 
     Parameters
     ----------
     difference:
-        Shape (3,): mean of the first over that of the second, minus 1, and the ends of its interval.
+        Shape (3,): the first entry's mean over the second's, minus 1, and the ends of its interval.
 
     >>> fewer(np.array([-0.5, -0.6, -0.25]), True)
     (0.5, 0.25, 0.6)

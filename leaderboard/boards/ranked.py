@@ -1,4 +1,4 @@
-"""What every board is made of: which entries are ranked together, on which cells, and their sample complexity there."""
+"""The parts of every board: entries that are ranked together, their common cells, and their sample complexity there."""
 
 from __future__ import annotations
 
@@ -55,20 +55,20 @@ WITH_LOOKS = (
 def of_one_definition(
     entries: Sequence[EntryResults], definitions: Mapping[str, str] | None = None
 ) -> tuple[list[EntryResults], list[str]]:
-    """Leave out entries of studies with looks or chosen seeds, and those of another task or world than most.
+    """Leave out entries of studies with looks, with chosen seeds, or of another task or world than most entries.
 
-    Another task is another definition of it; another world is other code of its environment, where a plugin makes it.
-    Of two that equally many have, the one whose hash comes first stays.
+    Another task is another definition of the task. Another world is other code of a plugin's environment. If equally
+    many entries have two definitions, the one whose hash comes first stays.
 
     Parameters
     ----------
     definitions:
-        Hashes by the names of tasks whose definition is known: that stays, however few have it.
+        Hash of the definition by task name. A definition that is given stays, however few entries have it.
 
     Returns
     -------
     tuple
-        The entries that stay, task by task, and one line for each that was left out.
+        The entries that stay, task by task, and one line for each entry that was left out.
     """
     problems = [f"{entry.folder}: {WITH_LOOKS}" for entry in entries if entry.plan]
     problems += [f"{entry.folder}: {entry.chosen_seeds}" for entry in entries if entry.chosen_seeds]
@@ -99,9 +99,9 @@ def of_one_definition(
 
 
 def ranking_of(entries: Sequence[EntryResults]) -> RankingSection:
-    """Return the cells and horizons that most entries of a task have; they are equal where it is registered.
+    """Return the cells and horizons that most entries of a task have; all have the same if the task is registered.
 
-    The scores of policies are those that most of these entries state, whatever the others do.
+    Scores of policies are taken from most of these entries, too, whatever the others state.
     """
     ranked = [entry.task_file.ranking for entry in entries]
     cells = [ranking.model_copy(update={"policies": {}}) for ranking in ranked]

@@ -27,7 +27,7 @@ from qrlsuite.statistics import (
 )
 
 OF_RUNS = {"score": final_scores, "area": areas}
-"""What may rank entries: a number of each run. So may what a task's `[ranking] costs` names, by its end."""
+"""Numbers of each run that rank entries. Metrics in a task's `[ranking] costs` rank, too, by their final value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,22 +37,22 @@ class ScoreSection:
     Attributes
     ----------
     task, horizon, by, alpha:
-        The task, the environment steps at which all are cut, `score`, `area` or a metric, and the error for all pairs
-        together.
+        The task; the environment steps at which all curves are cut; `score`, `area` or a metric; and the error for all
+        pairs together.
     entries:
-        The ranked ones, in the order of `results`.
+        The ranked entries, in the order of `results`.
     results:
         All statistics.
     n_last:
-        Epochs that a final score is the mean of.
+        Number of epochs in a final score, a mean.
     unranked:
         Labels of the entries with fewer than 20 seeds.
     of:
-        What the numbers are: `score`, or the metric's name.
+        Name of the numbers: `score`, or the metric's name.
     sign:
         1 where more is better, -1 where less is.
     shown:
-        Names of the entries that have a row; None means all. What is shown changes no rank.
+        Names of the entries that have a row; None means all. A hidden row changes no rank.
     """
 
     task: str
@@ -69,7 +69,7 @@ class ScoreSection:
 
     @property
     def title(self) -> str:
-        """What is ranked."""
+        """The title: task, horizon and number."""
         what = "area under the learning curve" if self.by == "area" else f"final {self.of}"
         return f"{self.task}, {steps_text(self.horizon)} steps, by {what}"
 
@@ -109,11 +109,11 @@ class ScoreSection:
         )
 
     def _turned(self, value: float, low: float, high: float) -> tuple[float, float, float]:
-        """Return a difference as what the first is ahead by."""
+        """Return a difference with the sign turned so that more is better for the first."""
         return (value, low, high) if self.sign > 0 else (-value, -high, -low)
 
     def _better(self, index: int, other: int) -> float:
-        """Return the probability that a seed of one entry is better than one of another."""
+        """Return the probability that a seed of one entry is better than a seed of another."""
         more = float(self.results.improvement[index, other])
         return more if self.sign > 0 else 1 - more
 
@@ -152,7 +152,7 @@ class ScoreSection:
         return Sheet.of(self.title, self.columns(), rows, self.notes(), ("entry",), label, explain, name)
 
     def _places(self) -> list[int]:
-        """Return the places of the order that are shown."""
+        """Return the places in the order of the entries that have a row."""
         names = [self.entries[index].name for index in self.order]
         return [place for place, name in enumerate(names) if self.shown is None or name in self.shown]
 
@@ -200,7 +200,7 @@ class ScoreSection:
 def rank_by_score(
     entries: Sequence[EntryResults], horizon: int, by: str = "score", alpha: float = 0.05
 ) -> ScoreSection:
-    """Rank the entries of one task at one horizon by their scores, or by what its `[ranking] costs` names.
+    """Rank the entries of one task at one horizon by their scores, or by a metric of its `[ranking] costs`.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def rank_by_score(
 
 
 def _measured(entry: EntryResults, name: str) -> NDArray[np.float64]:
-    """Return what an entry's environment measured, (N, T)."""
+    """Return a metric of an entry's environment, (N, T)."""
     values = entry.metrics.get(name)
     if values is None or np.isnan(values).any():
         raise OptionError(

@@ -30,7 +30,7 @@ from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, final_scores,
 from qrlsuite.statistics.compare import TOO_FEW
 
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
-"""What a spreadsheet shows of the win that a tier rests on."""
+"""Columns of a spreadsheet about the win that a tier rests on."""
 
 
 @dataclass(frozen=True)
@@ -86,15 +86,15 @@ class Row:
     provisional: bool
     """Fewer seeds than the task's protocol asks for."""
     not_reached: bool = False
-    """At the cap in every cell: below those that outperform it, not ranked among others like it."""
+    """At the cap in every cell: below the entries that outperform it, not ranked among others like it."""
     costs: Mapping[str, float | None] = field(default_factory=dict)
-    """By name, the mean over seeds and the last tenth of the epochs of what `[ranking] costs` names."""
+    """Metrics of `[ranking] costs` by name: means over seeds and the last tenth of the epochs."""
     rests_on: Support | None = None
     """None in the first tier, and without a tier."""
 
     @property
     def depth(self) -> float:
-        """What orders entries on the board: the tier, then those that reached no goal; 0 where undecided."""
+        """The sort key on the board: the tier, infinity for an entry at the cap everywhere, 0 if undecided."""
         return float("inf") if self.not_reached else float(self.tier or 0)
 
     @property
@@ -121,13 +121,13 @@ class Section:
     rule: str = DEFAULT
     """Name of the significance rule that the tiers rest on."""
     promise: str = ""
-    """What that rule controls."""
+    """The error that the rule controls."""
     by_tiers: bool = False
     """Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it."""
     score: ScoreSection = field(default_factory=ScoreSection)
-    """What is ranked."""
+    """The score that is ranked."""
     costs: tuple[str, ...] = ()
-    """What is shown beside it."""
+    """The metrics that stand beside the score."""
     policies: Mapping[str, float] = field(default_factory=dict)
     """Final scores of policies to compare with, by name, as the task's `[ranking.policies]` says."""
 
@@ -138,7 +138,7 @@ class Section:
 
     @property
     def hash(self) -> str:
-        """16 hexadecimal digits of what is ranked: entries with their tasks, seeds and scores, in any order."""
+        """16 hexadecimal digits of the ranked entries with their tasks, seeds and scores, in any order."""
         return digest([self.horizon, sorted(map(_content, (row.entry for row in self.rows)))])
 
     def as_dict(self) -> dict[str, Any]:
@@ -328,7 +328,7 @@ def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, st
 
 
 def untiered_reason(row: Row) -> str:
-    """Say why an entry has no tier."""
+    """Return why an entry has no tier."""
     if row.not_reached:
         return "not reached: at the cap in every cell, and not ranked among each other"
     if len(row.entry.seeds) < MIN_RUNS:

@@ -42,9 +42,9 @@ def sheets(sections: Sequence[Section], explain: bool = False) -> list[Sheet]:
 
 
 def main_section(sections: Sequence[Section]) -> Section:
-    """Return the section of a task that is shown: not provisional if there is one, with most entries, the longest.
+    """Return the section to show of a task: the one with most entries, then the longest; not provisional if possible.
 
-    Of provisional ones it is that at which most entries end: one that has just begun cuts nobody.
+    Among provisional sections it is the one at which most entries end: an entry that has just begun cuts no other.
     """
 
     def entries(section: Section) -> int:
@@ -57,7 +57,7 @@ def main_section(sections: Sequence[Section]) -> Section:
 
 
 def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
-    """Write a line for every entry of other horizons, and what to type to see them in a table."""
+    """Return a line for every entry of other horizons, and the command that shows them in a table."""
     told, lines = {row.entry.name for row in main.rows}, []
     for section in sorted(sections, key=lambda each: -each.horizon):
         for row in section.times.rows:
@@ -107,7 +107,7 @@ def title(section: Section) -> str:
 
 
 def names(entries: Sequence[EntryResults]) -> list[str]:
-    """Return what entries are called in a table: without the algorithm where all have the same."""
+    """Return the names of entries in a table: their labels, without the algorithm if all share it."""
     alike = len({entry.algorithm for entry in entries}) == 1
     return [
         (entry.label.removeprefix(f"{entry.algorithm} ") if alike else entry.label)
@@ -187,7 +187,7 @@ def _tier_columns(section: Section) -> list[Column]:
 
 
 def _complexity(section: Section) -> str:
-    """Say what the sample complexity is."""
+    """Define the sample complexity in words."""
     goal = "score 1 - epsilon or more" if section.times.kind == "epsilon" else "have reached a threshold"
     return f"steps until a share delta of the seeds {goal}, here at {section.cell}"
 
@@ -272,7 +272,7 @@ def _rank_notes(section: Section) -> list[str]:
 
 
 def policies_text(section: Section) -> str:
-    """Say what other policies score, as the end of a note: `; final score of random 0.51, greedy 0.72`."""
+    """Return the scores of other policies, as the end of a note: `; final score of random 0.51, greedy 0.72`."""
     told = ", ".join(f"{name} {value:.4g}" for name, value in section.policies.items())
     return f"; final {section.score.called} of {told}" * bool(told)
 
@@ -310,7 +310,7 @@ def _diverged(section: Section) -> list[str]:
 
 
 def _never(section: Section) -> list[str]:
-    """Say which ranked entries stay below every threshold, and what tells them apart nevertheless."""
+    """Name the ranked entries that stay below every threshold, and the axis that ranks them nevertheless."""
     found = [row for row in section.times.rows if row.at_cap == 1 and row.ranks is not None]
     told = ", ".join(name for name in names([row.entry for row in found]))
     line = (
@@ -325,7 +325,7 @@ def _of_seeds(entry: EntryResults) -> str:
 
 
 def facts(section: Section) -> list[str]:
-    """Say what else to know of a section's entries."""
+    """Return further notes on a section's entries."""
     lines = []
     alone = [row.entry.label for row in section.rows if row.entry.first_network_alone]
     if alone:
@@ -371,7 +371,7 @@ def facts(section: Section) -> list[str]:
 
 
 def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
-    """Say of which entries the thresholds changed after their first seed: they may have been chosen to flatter."""
+    """Name the entries whose thresholds changed after their first seed: they may have been chosen to flatter."""
     used = sorted(ranking_of(entries).grid.thresholds) if entries else []
     labels = [
         entry.label
@@ -384,7 +384,7 @@ def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
 
 
 def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
-    """Say which entries have curves of another program, began with trained agents, or had another text of a plugin."""
+    """Name the entries with curves of another program, with trained agents at the start, or with edited plugins."""
     lines = {
         "curves that other programs made, and nobody here can train or check again": [
             entry.label for entry in entries if entry.external
@@ -408,7 +408,7 @@ def _grouped(labels: Mapping[str, Hashable]) -> str:
 
 
 def _edited(entries: Sequence[EntryResults]) -> list[str]:
-    """Say of which plugin's file entries were trained with different contents: a circuit, and its control of before."""
+    """Name the plugin files that were edited between entries of this board."""
     lines = []
     for name in sorted({name for entry in entries for name in entry.plugins}):
         groups = _grouped({entry.label: entry.plugins[name] for entry in entries if name in entry.plugins})
@@ -418,7 +418,7 @@ def _edited(entries: Sequence[EntryResults]) -> list[str]:
 
 
 def unequal_tuning(section: Section) -> list[str]:
-    """Say where entries that were tuned unequally are ranked against each other."""
+    """Return notes on entries that are ranked against each other, but were tuned unequally."""
     tuned = [row.entry.tuning for row in section.rows if row.entry.tuning]
     lines = []
     if 0 < len(tuned) < len(section.rows):
@@ -433,7 +433,7 @@ def unequal_tuning(section: Section) -> list[str]:
 
 
 def _tuning_text(tuning: Mapping[str, Any], preset: str | None) -> str:
-    """Say what finding an entry's settings took, as far as it is known: `7 trials, 0.12 core-hours`.
+    """Return the budget of an entry's tuning as far as it is known: `7 trials, 0.12 core-hours`.
 
     A preset's own note comes first: the settings may have been found for another size of the model.
     """

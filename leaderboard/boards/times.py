@@ -1,7 +1,7 @@
-"""A section of a board by steps below threshold: who outperforms whom, and which ranks that leaves.
+"""A section of a board by steps below threshold: who outperforms whom, and the ranks that remain.
 
-`rank_by_time` computes everything once; tables, files and the page
-write what it returns. The statistics are in `qrlsuite.statistics.times_board`.
+`rank_by_time` computes everything once; tables, files and the page write its result. The statistics are in
+`qrlsuite.statistics.times_board`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class TimeRow:
     place:
         1 for the smallest M; None below 20 seeds.
     place_at_half:
-        The same if all entries had ended at half the horizon.
+        The place if all entries had ended at half the horizon.
     ranks:
         Best and worst rank that the decided pairs leave; None below 20 seeds.
     at_cap:
-        Share of the times that are the horizon, over runs and thresholds: these runs never got there.
+        Share of the times, over runs and thresholds, that are the horizon: the run never reached the threshold.
     difference:
-        M over that of the first entry shown, minus 1, and its interval; None for the first, and below 20 seeds.
+        M over the M of the first shown entry, minus 1, and its interval; None for the first, and below 20 seeds.
     few:
-        Whether it has fewer than 50 seeds, and another ranked entry another number.
+        Whether it has fewer than 50 seeds, and another ranked entry has another number of seeds.
     """
 
     entry: EntryResults
@@ -72,11 +72,11 @@ class TimeRanking:
     board:
         All pairs, in the order in which the entries were given.
     rows:
-        The entries that are shown, in the order of M.
+        The shown entries, in the order of M.
     order:
         Index in `board` of each row.
     kind, levels:
-        What the grid's thresholds are, `epsilon` or `threshold`, and their values.
+        The kind of the grid's thresholds, `epsilon` or `threshold`, and their values.
     """
 
     board: TimesBoard
@@ -97,7 +97,7 @@ class TimeRanking:
 
     @property
     def n_decided(self) -> int:
-        """Pairs of them that are decided, trade-offs among them, be the entries shown or not."""
+        """Number of decided pairs, with trade-offs, whether or not the entries are shown."""
         return sum(decided(each) for row in self.board.directions for each in row) // 2
 
     @property
@@ -106,7 +106,7 @@ class TimeRanking:
         return sum(count >= MIN_RUNS for count in self.board.n_runs)
 
     def trade_offs(self) -> list[str]:
-        """Name every pair of which each needs fewer steps at some threshold."""
+        """Return a line for every pair in which each entry needs fewer steps at some threshold."""
         return [
             f"trade-off: {self._label(i)} needs fewer steps at {self._thresholds(i, j)}; "
             f"{self._label(j)} at {self._thresholds(j, i)}"
@@ -201,7 +201,7 @@ class TimeRanking:
         }
 
     def _pairs(self) -> list[tuple[int, int]]:
-        """All pairs, the one with the smaller M first."""
+        """All pairs, the entry with the smaller M first."""
         return [(i, j) for place, i in enumerate(self.order) for j in self.order[place + 1 :]]
 
     def _thresholds(self, i: int, j: int) -> str:
@@ -269,7 +269,7 @@ def rank_by_time(
 
 
 def decided(direction: Direction) -> bool:
-    """Return whether a pair is told apart, be it by a trade-off."""
+    """Return whether a pair is decided; a trade-off counts."""
     return direction in (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
 
 

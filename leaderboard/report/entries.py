@@ -29,13 +29,13 @@ class EntryView:
     Attributes
     ----------
     color:
-        Number of its color and pattern: that of the entry in every section and picture of the page.
+        Number of the entry's color and pattern in every section and picture of the page.
     legend:
-        The label, with the ansatz where there is one.
+        The label, with the ansatz if there is one.
     facts:
-        What it was made with: (term, description).
+        Code, machine and settings: (term, description).
     commands:
-        What repeats it and shows more: (term, command line).
+        Commands that repeat the entry or show more of it: (term, command line).
     options:
         (heading, lines), a line being (option, value).
     """
@@ -105,9 +105,9 @@ def _facts(entry: EntryResults) -> list[tuple[str, str]]:
 
 
 def _commands(entry: EntryResults) -> list[tuple[str, str]]:
-    """Return the command lines that train it, check it, draw its curves and play its agents, where they can be given.
+    """Return the command lines that train an entry, check it, draw its curves and play its agents.
 
-    Of curves that other programs made, and of tasks that are not installed, none is known.
+    Curves of other programs, and tasks that are not installed, have none.
     """
     changed = changed_options(entry)
     if entry.external or entry.plan or changed is None:
@@ -143,14 +143,14 @@ def changed_options(entry: EntryResults) -> list[str] | None:
 
 
 def _networks(entry: EntryResults) -> str:
-    """Say over how many networks parameters are summed, where that is not one."""
+    """Return how many networks the parameters are summed over; empty for one."""
     if entry.first_network_alone:
         return " (first network alone)"
     return f" in {entry.networks} networks" if entry.networks is not None and entry.networks > 1 else ""
 
 
 def _tuned(record: Mapping[str, Any] | None) -> str:
-    """Say how much it took to find the settings."""
+    """Return the budget of tuning."""
     if record is None:
         return ""
     return ", ".join(
@@ -191,7 +191,7 @@ def _plain(value: Any) -> str:
 def curves_data(entries: Sequence[EntryView]) -> list[dict[str, Any]]:
     """Return the learning curves of all entries for the page's scripts.
 
-    The median and the percentiles are those of all runs; single runs are thinned where a page has many.
+    The median and the percentiles are computed from all runs; a page with many runs draws only some of them.
     """
     total = sum(view.curves.curves.size for view in entries)
     share = min(1.0, SINGLE_RUNS / max(total, 1))

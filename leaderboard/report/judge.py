@@ -56,7 +56,7 @@ class Judgement:
     Attributes
     ----------
     evidence:
-        By (entry's place, number of runs): what each verdict rests on. The entry's own number is always there.
+        The evidence of each verdict, by (entry's place, number of runs). The entry's own number is always a key.
     """
 
     grid: Grid
@@ -84,7 +84,7 @@ class Judgement:
 
 
 def judge(section: Section) -> Judgement:
-    """Return the pairs of a section, in the order of its rows, with what each verdict rests on."""
+    """Return the pairs of a section, in the order of its rows, with the evidence of each verdict."""
     entries, horizon, board = [row.entry for row in section.rows], section.horizon, section.pairs
     grid = ranking_of(entries).grid
     curves = tuple(learning_curves(entry).cut(horizon) for entry in entries)

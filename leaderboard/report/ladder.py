@@ -1,7 +1,7 @@
-"""The tier graph: entries one below the other, and an arc from each to those it outperforms.
+"""The tier graph: entries one below the other, and an arc from each to the entries that it outperforms.
 
-A list with arcs beside it stays readable from 3 to 30 entries, on a phone and on paper, where boxes and arrows
-do not. Arcs that follow from a chain of others are left out.
+A list with arcs stays readable from 3 to 30 entries, on a phone and on paper; boxes and arrows do not. Arcs that
+follow from a chain of other arcs are left out.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Ladder:
     arcs: tuple[Arc, ...]
     implied: int
     chains_without_win: int
-    """Pairs joined by a chain of arcs, of which the upper does not outperform the lower."""
+    """Number of pairs that a chain of arcs joins although the upper does not outperform the lower."""
 
 
 def draw(beats: NDArray[np.bool_], tiers: Sequence[float]) -> Ladder:
@@ -72,9 +72,9 @@ def draw(beats: NDArray[np.bool_], tiers: Sequence[float]) -> Ladder:
 
 
 def reduced(beats: NDArray[np.bool_], tiers: Sequence[float]) -> NDArray[np.bool_]:
-    """Return the relation without pairs that a chain of others, each a tier further down, stands for.
+    """Return the relation without the pairs that follow from a chain of other pairs, each a tier further down.
 
-    Pairs inside a tier (a circle) all stay. Every chain of the relation is a chain of what is kept.
+    Pairs inside a tier (a circle) all stay. The chains of the result are the chains of the relation.
     """
     order = np.array(tiers, dtype=np.float64)
     down = beats & (order[:, None] < order[None, :])

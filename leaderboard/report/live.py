@@ -31,7 +31,7 @@ TRIED = 20
 LOOKS = 2.0
 """Seconds from one look at the results folder to the next."""
 PLACE = 'data-page=""'
-"""Where a page holds its name, which it compares with that of the newest."""
+"""The place of a page's name, which the page compares with the newest name."""
 REST = 4.0
 """After a look that took long the next one waits for so many times as long: runs need the processor."""
 
@@ -87,7 +87,7 @@ class Live:
         ).encode()
 
     def _look(self) -> list[object]:
-        """Look at the folder; returns what changes when the board may."""
+        """Look at the folder; returns facts that change whenever the board may have changed."""
         statuses = self._survey()
         self._problem = "; ".join(status.queue_problem for status in statuses if status.queue_problem)
         self._groups = [group for status in statuses for group in _groups(status)]
@@ -96,7 +96,7 @@ class Live:
 
 
 def _groups(status: EntryStatus) -> list[dict[str, Any]]:
-    """Return what the page shows of the groups of an entry: numbers, and text that is harmless."""
+    """Return the groups of an entry for the page: numbers and harmless text."""
     shown = []
     for group, plain in zip(status.groups, status.as_dict()["groups"], strict=True):
         epoch, epochs, score, left = (
@@ -120,7 +120,7 @@ def _groups(status: EntryStatus) -> list[dict[str, Any]]:
 
 
 class Server(ThreadingHTTPServer):
-    """Listens on 127.0.0.1 alone, and answers with what `serve` gives it.
+    """Listens on 127.0.0.1 alone, and answers with the pages that `serve` sets.
 
     Parameters
     ----------
@@ -150,12 +150,12 @@ class Server(ThreadingHTTPServer):
         raise OptionError(f"--port {port}: {why}; without --port the first free one from {PORT} on is taken")
 
     def server_bind(self) -> None:
-        """Bind, without asking a name server what this machine is called."""
+        """Bind without asking a name server for this machine's name."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = HOST, self.server_address[1]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of browsers that hang up."""
+        """Ignore browsers that hang up."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
@@ -188,7 +188,7 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def end_headers(self) -> None:
-        """Forbid browsers to keep the answer, to guess what it is, and to show it inside another page."""
+        """Forbid browsers to keep the answer, to guess its type, and to show it inside another page."""
         for name, value in (
             ("Cache-Control", "no-store"),
             ("X-Content-Type-Options", "nosniff"),

@@ -21,12 +21,12 @@ from qrlsuite.studies.outcome import (
 
 WIDTH, HEIGHT = 380, 230
 LEFT, RIGHT, TOP, BOTTOM = 46, 12, 12, 38
-"""Of the picture, in its own units: all of it, and the margins around the plot."""
+"""Margins around the plot, in the picture's units."""
 
 
 @dataclass(frozen=True)
 class PairLine:
-    """A pair of the table; `color` is that of its line in the picture, and `question` what it answers, if anything."""
+    """A pair of the table, with the color of its line in the picture, and the question that it answers, if any."""
 
     color: int
     question: str

@@ -17,7 +17,7 @@ class RowView:
     place: int
     entry: EntryView
     name: str
-    """The label, without the algorithm where all entries of the board have the same."""
+    """The label, without the algorithm if all entries of the board share it."""
     row: Row
     time: TimeRow
     mean: str
@@ -32,14 +32,14 @@ class RowView:
 
     @property
     def kind(self) -> str:
-        """`quantum`, `classical`, or `external`: of what another program trained, nobody here knows what it is."""
+        """`quantum`, `classical`, or `external`: another program trained it, and its kind is unknown."""
         if self.entry.curves.external:
             return "external"
         return "quantum" if self.entry.quantum else "classical"
 
 
 def row_view(place: int, row: Row, entry: EntryView, name: str, section: Section) -> RowView:
-    """Return a line; `row` and `entry` are those of its place."""
+    """Return the line of a place from its row and its entry."""
     reference, horizon, time = row.reference, section.horizon, section.times.rows[place]
     mean, low, high = time.mean.mean, *time.mean.interval
     kind, levels = section.times.kind, section.times.levels

@@ -44,10 +44,10 @@ class SectionView:
     changed: str
     """Options of the environment in which the task differs from the registered one."""
     algorithm: str
-    """That of all entries; empty where they differ."""
+    """The algorithm of all entries; empty if they differ."""
     lead: str
     answers: tuple[str, ...]
-    """What the board says of the pairs that a reader asks for first, in sentences."""
+    """The board's verdicts, in sentences, on the pairs that a reader asks for first."""
     winners: Winners
     citation: Citation
     picked: tuple[int, ...]
@@ -186,7 +186,7 @@ def _verdict(section: Section, grid: Grid, one: RowView, other: RowView, kinds: 
 
 
 def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
-    """Say in one sentence who is in front, among all entries that are compared."""
+    """Return a sentence that names the leading entry among all compared entries."""
     ranked = [row for row in rows if row.time.ranks is not None]
     if not ranked:
         return f"No entry is ranked: {TOO_FEW.partition(': ')[2]}."
@@ -227,7 +227,7 @@ def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str]
 def _data(
     section: Section, judgement: Judgement, rows: Sequence[RowView], ranking: RankingSection
 ) -> dict[str, Any]:
-    """Return what the page's scripts need of a section."""
+    """Return a section's data for the page's scripts."""
     reference = ranking.reference
     external = any(row.entry.curves.external for row in rows)
     level = 1 - reference.epsilon if reference.epsilon is not None else reference.threshold
@@ -269,7 +269,7 @@ def _numbers(evidence: Evidence) -> dict[str, list[int]]:
 
 
 def extent(sections: Sequence[SectionView], entries: Sequence[EntryView]) -> str:
-    """Say how much the page rests on."""
+    """Return the numbers of entries, tasks, runs and core-hours behind the page."""
     tasks = {view.section.task for view in sections}
     runs = sum(len(entry.curves.seeds) for entry in entries)
     hours = sum(entry.curves.hours for entry in entries)

@@ -16,7 +16,7 @@ BARS = ((0.2, 0.15, 0.1), (0.5, 0.75))
 
 @dataclass(frozen=True)
 class CellView:
-    """A cell of a surface: its text, its shade and what a pointer shows; `interval` is in percent of the horizon."""
+    """A cell of a surface: its text, its shade and its tooltip; `interval` is in percent of the horizon."""
 
     text: str
     level: int

@@ -43,10 +43,10 @@ class Winners:
         )
 
     def asked(self, rows: Sequence[RowView]) -> list[tuple[RowView, RowView]]:
-        """Return the pairs that are told first, the entry with fewer steps first.
+        """Return the pairs to show first, the entry with fewer steps first.
 
-        All pairs of up to three ranked entries; of more, the best circuit with the best network and with that of its
-        size, or the first and the last where there is one kind.
+        Up to three ranked entries make all pairs. More entries: the best circuit with the best network and with the
+        network of its size, or the first and the last if there is only one kind.
         """
         ranked = _ranked(rows)
         if len(ranked) <= 3:
