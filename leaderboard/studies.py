@@ -20,7 +20,7 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.looks import StudyWithLooks, has_begun
 from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.runner import PendingEntry
 from qrlsuite.studies.study import Member, PictureSection, Study, load
@@ -104,10 +104,10 @@ def find(name: str) -> Study:
 
 def read_outcome(name: str, runs: Path) -> StudyOutcome:
     """Return what a study with looks has decided: in the results folder where it has begun, else as published."""
-    study = StudyWithLooks(find(name), runs)
-    folder = published_studies.folder_of(name)
-    if folder is not None and (folder == Path(name) or not study.begun):
+    found, folder = find(name), published_studies.folder_of(name)
+    if folder is not None and (folder == Path(name) or not has_begun(runs, found.name)):
         return published_studies.read(folder)
+    study = StudyWithLooks(found, runs)
     return StudyOutcome(study, study.read())
 
 

@@ -41,7 +41,7 @@ class QFWPOptions(QLSTMOptions):
     def check(self) -> None:
         """Refuse a circuit without angles to write into, and what `vqc` refuses."""
         super().check()
-        _written(vqc.build_circuit(self))
+        _written(self._circuit)
 
 
 def _written(circuit: Any) -> dict[str, tuple[int, int]]:

@@ -27,6 +27,7 @@ One module serves all backends; the models differ in which backend computes the 
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import field, fields
@@ -179,9 +180,14 @@ class VQCOptions:
     def __class_getitem__(cls, backend: str) -> type[VQCOptions]:
         return options_on(cls, backend)
 
+    @functools.cached_property
+    def _circuit(self) -> Circuit:
+        """The circuit, shared by all that is built of these options."""
+        return build_circuit(self)
+
     def check(self) -> None:
-        """Build the circuit once, so that one that cannot be built is refused before anything is trained."""
-        circuit = build_circuit(self)
+        """Build the circuit, so that one that cannot be built is refused before anything is trained."""
+        circuit = self._circuit
         if self.train not in ("all", "linear", *circuit.parameters):
             choices = ("all", "linear", *circuit.parameters)
             raise OptionError(
@@ -205,7 +211,7 @@ class _Runner:
 
     def __init__(self, options: VQCOptions) -> None:
         self.options = options
-        self.circuit = build_circuit(options)
+        self.circuit = options._circuit
         shots: int | None = getattr(options, "shots", None)
         self.executions = ExecutionCounter(
             shots, shift_evaluations(self.circuit), self.circuit.mean_field, len(in_bases(self.circuit))
@@ -556,7 +562,7 @@ def _pennylane_memory(options: Any, agents: int, batch: int, copies: int) -> int
 
 def _amplitudes(options: VQCOptions) -> int:
     """Return how many amplitudes the states of connected qubits have; 0 where none are connected."""
-    circuit = build_circuit(options)
+    circuit = options._circuit
     sizes = [] if circuit.mean_field else map(len, circuit.components())
     return sum(1 << size for size in sizes if size > 1)
 

@@ -26,6 +26,7 @@ from qrlsuite.engine.work import EngineOutcome, Missing, RemoteEngine, Snapshot,
 from qrlsuite.errors import FileError, OptionError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import codes, probes, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
@@ -106,19 +107,23 @@ def run(
         Whether to show nothing.
     """
     check_budget(budget, where)
-    require_same_code(runs, [entry], where, quiet)
+    [code] = require_same_code(runs, [entry], where, quiet)
     work = find(runs, entry, where, seeds, epochs)
     display = RunDisplay(work, where.workers, quiet)
     display.expected = None if quiet else expected(work, where)
-    outcome = train(work, where, display, budget, confirmed)
+    if work.groups:
+        require_trainable([entry], where)
+    outcome = train(work, where, display, budget, confirmed, code)
     if outcome.submitted is None and not quiet and display.again == "command":
         at_work = [group for group in groups(work.store) if group.state in ("running", "submitted")]
         display.finished(summarize(work), [group for group in at_work if {*group.seeds} & work.busy])
     return Training(work, outcome.submitted)
 
 
-def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False) -> None:
-    """Refuse entries of which another code has begun seeds: before they are planned, and anything is trained.
+def require_same_code(
+    runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False
+) -> list[CodeIdentity]:
+    """Return the entries' code; refuse those of which another code has begun seeds, before anything is planned.
 
     With `where.fresh`, such seeds are set aside, which is said unless `quiet`; with `where.same`, the codes are
     declared to be the same.
@@ -128,8 +133,9 @@ def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet:
             "--fresh and --same: the old seeds are either set aside or continued; give one of them"
         )
     console = Console(stderr=True, quiet=quiet, highlight=False)
-    for entry in entries:
-        store, code = EntryStore.find(runs, entry), identity.of(entry)
+    computed = [identity.of(entry) for entry in entries]
+    for entry, code in zip(entries, computed):
+        store = EntryStore.find(runs, entry)
         if where.same is not None:
             codes.declare_same(store, code, where.same)
         elif where.fresh:
@@ -140,6 +146,7 @@ def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet:
                 console.print(line, markup=False, soft_wrap=True)
         else:
             codes.require(store, code)
+    return computed
 
 
 def require_trainable(entries: Sequence[Entry], where: Where) -> None:
@@ -178,6 +185,7 @@ def train(
     display: RunDisplay,
     budget: str | None = None,
     confirmed: bool = True,
+    code: CodeIdentity | None = None,
 ) -> EngineOutcome:
     """Train what is planned, showing progress; returns how it ended.
 
@@ -187,6 +195,8 @@ def train(
         After which training stops, with every finished epoch saved. None for no limit.
     confirmed:
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
+    code:
+        The entry's, where `require_same_code` has just returned it; None computes it and refuses another one.
     """
     began, limit = time.monotonic(), seconds(budget, where.workers)
 
@@ -200,12 +210,11 @@ def train(
     if work.entry.start is not None:  # what is missing is said before anything is trained
         work.store.initial([seed for group in work.groups if group.epoch == 0 for seed in group.seeds])
     display.deadline = None if limit is None else began + limit
-    code = identity.of(work.entry)
-    codes.require(work.store, code)
+    if code is None:
+        code = identity.of(work.entry)
+        codes.require(work.store, code)
     if certain(work.store):  # somebody has begun it, and maybe no seed says so yet
         codes.require_sent(work.store, code, socket.gethostname())
-    if work.groups:
-        require_trainable([work.entry], where)
     if not where.remote and work.groups:
         _check_device(where.device)
         check_memory(work, where)
@@ -264,8 +273,7 @@ def check_memory(work: Missing, where: Where) -> None:
 def summarize(work: Missing) -> dict[str, Any]:
     """Return what a (partly) finished training amounts to by now, as plain values."""
     store, epochs = work.store, work.epochs
-    curves = {seed: store.seed(seed).read() for seed in work.seeds if store.seed(seed).record()}
-    runs = [run for run in curves.values() if len(run.scores) >= epochs]
+    runs = [run for seed in work.seeds if len((run := store.seed(seed).read()).scores) >= epochs]
     complete = [run.curve[:epochs] for run in runs]
     file = work.entry.task.file
     grid, sign = file.ranking.grid, file.score.sign

@@ -183,7 +183,7 @@ class Entry:
 
 
 def resolve(
-    task_name: str,
+    task: str | Task,
     entry: str | Written,
     algorithm: str | None = None,
     settings: Sequence[Setting] = (),
@@ -193,6 +193,8 @@ def resolve(
 
     Parameters
     ----------
+    task:
+        Its name or file, or what `qrlsuite.experiment.task.load` made of it.
     entry:
         As `qrlsuite.notation.parse_entry` reads it: a model's name alone, or an entry's label.
     algorithm, settings, preset:
@@ -209,7 +211,8 @@ def resolve(
         raise OptionError(
             f"{notation.START}={written.start}: write TASK/ENTRY:EPOCHS, or run it with --from ENTRY"
         )
-    task, model = load(task_name), registry.get(specs.ModelSpec, written.model)
+    task = task if isinstance(task, Task) else load(task)
+    model = registry.get(specs.ModelSpec, written.model)
     file = _preset_file(written)
     spec = registry.get(
         specs.AlgorithmSpec, written.algorithm or (file.algorithm if file else task.file.default_algorithm)

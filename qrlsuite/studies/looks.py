@@ -136,7 +136,7 @@ class StudyWithLooks:
         if self.begun and (self.folder / FILE).is_file():
             self.file = _with_code_of(self.file, load_kept(self.folder / FILE).file)
         self.looks = self.file.looks or LooksSection()
-        self.hash = _hash(self.file)
+        self.hash = digest(_content(self.file))
         self.epochs = self.looks.epochs or 0
         tables = self.file.entries
         names = tuple(table.name or name for table, name in zip(tables, _names([m.entry for m in members])))
@@ -198,7 +198,7 @@ class StudyWithLooks:
     @property
     def begun(self) -> bool:
         """Whether a seed was begun: from then on the study is fixed."""
-        return any(self.folder.glob("*/*/seed-*"))
+        return has_begun(self.runs, self.name)
 
     def check(self) -> bool:
         """Refuse a study that changed after it began, or whose seeds were trained before; return whether it began."""
@@ -212,9 +212,8 @@ class StudyWithLooks:
                     f"with looks needs seeds that nobody has seen; with first_seed = {self._next_block()} it has others"
                 )
             return False
-        kept = StudyWithLooks(load_kept(self.folder / FILE), self.runs)
-        if kept.hash != self.hash:
-            before, after = _content(kept.file), _content(self.file)
+        before, after = _content(load_kept(self.folder / FILE).file), _content(self.file)
+        if digest(before) != self.hash:
             changes = [
                 f"{key} (was {_short(before.get(key))}, is {_short(after.get(key))})"
                 for key in {**before, **after}
@@ -358,6 +357,11 @@ class StudyWithLooks:
             taken[look] = _now()
             append(self.folder / LOG, json_line({"time": taken[look], "plan": self.hash, **line}))
         return replace(state, taken=taken)
+
+
+def has_begun(runs: Path, name: str) -> bool:
+    """Return whether a results folder has a seed of the study with a name."""
+    return any((runs / FOLDER / name).glob("*/*/seed-*"))
 
 
 def new(
@@ -531,6 +535,7 @@ def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
 def _content(file: StudyFile) -> dict[str, Any]:
     """Return all that decides, in the layout of version 0.1, whose studies keep their hash."""
     looks = (file.looks or LooksSection()).model_dump(mode="json")
+    task = next((table.task for table in file.entries), None)
     if not looks["questions"]:
         del looks["questions"]
     keys = {"model", "algorithm", "preset", "options", "hash", "name", "tuning", "code"}
@@ -539,11 +544,7 @@ def _content(file: StudyFile) -> dict[str, Any]:
         for key in ("name", "tuning", "code"):
             if entry[key] is None:
                 del entry[key]
-    return {"format_version": 1, "name": file.name, "task": file.entries[0].task, **looks, "entries": entries}
-
-
-def _hash(file: StudyFile) -> str:
-    return digest(_content(file))
+    return {"format_version": 1, "name": file.name, "task": task, **looks, "entries": entries}
 
 
 def _lines(design: SequentialDesign, decision: Decision) -> list[dict[str, Any]]:

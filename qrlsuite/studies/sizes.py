@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from qrlsuite.errors import OptionError
@@ -28,8 +29,9 @@ def nearest_size(make: Callable[[int], Entry], target: Entry) -> int:
         The entry to be matched. Where two sizes are equally near, the smaller is taken.
     """
     target_size = parameters(target)
+    size_of = functools.cache(lambda size: parameters(make(size)))
     low, high = 1, 1
-    while parameters(make(high)) < target_size:
+    while size_of(high) < target_size:
         low, high = high, 2 * high
         if high > LARGEST_SIZE:
             raise OptionError(
@@ -37,11 +39,8 @@ def nearest_size(make: Callable[[int], Entry], target: Entry) -> int:
             )
     while low < high:
         middle = (low + high) // 2
-        if parameters(make(middle)) < target_size:
+        if size_of(middle) < target_size:
             low = middle + 1
         else:
             high = middle
-    return min(
-        (size for size in (low - 1, low) if size >= 1),
-        key=lambda size: abs(parameters(make(size)) - target_size),
-    )
+    return min((size for size in (low - 1, low) if size >= 1), key=lambda s: abs(size_of(s) - target_size))

@@ -7,6 +7,7 @@ many seeds as it takes, on seeds of its own: see `qrlsuite.studies.looks`.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from qrlsuite import files, notation, options, own, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.preset import EntryTuning
+from qrlsuite.experiment.task import Task
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting, Table
 from qrlsuite.results.text import counted
@@ -246,7 +248,7 @@ class Study:
         models:
             Models to be used in the place of others, by name.
         """
-        models = models or {}
+        models, task_of = models or {}, functools.cache(load_task)
         named: set[str] = set()
         by_group: dict[str | None, list[Member]] = {}
         every: list[Member] = []
@@ -257,7 +259,8 @@ class Study:
             try:
                 for draft, target in itertools.product(_drafts(group), targets):
                     named.add(draft.written.model)
-                    member = _member(group, draft, settings, models, target, used)
+                    task = task_of(draft.task)
+                    member = _member(group, draft, task, settings, models, target, used)
                     members.setdefault((member.entry.task.name, member.entry.name), member)
             except QrlSuiteError as error:
                 place = f"entries.{index}" if group.name is None else f"group '{group.name}'"
@@ -307,22 +310,19 @@ def _drafts(group: EntriesSection) -> Iterator[_Draft]:
 def _member(
     group: EntriesSection,
     draft: _Draft,
+    task: Task,
     settings: Sequence[Setting],
     models: Mapping[str, str],
     target: Entry | None,
     used: set[tuple[str | None, str]],
 ) -> Member:
     written = replace(draft.written, model=models.get(draft.written.model, draft.written.model))
-    loaded = load_task(draft.task)
-    algorithm = registry.get(specs.AlgorithmSpec, written.algorithm or loaded.file.default_algorithm)
-    every = [*written.settings, *settings]
-    sides = option_sides(loaded, algorithm, registry.get(specs.ModelSpec, written.model), every)
-    applicable = [s for s in settings if _has(sides, s)]
+    applicable = _applicable(written, task, settings) if settings else []
     used |= {(s.side, s.name) for s in applicable}
     all_settings = [*written.settings, *applicable]
 
     def entry(*more: Setting) -> Entry:
-        return resolve(draft.task, replace(written, settings=(*all_settings, *more)))
+        return resolve(task, replace(written, settings=(*all_settings, *more)))
 
     if target is not None and group.match is not None:
         option = group.match.option
@@ -338,6 +338,14 @@ def _member(
     }
     alone |= {"options": options_, "grid": {}, "match": None}
     return Member(group.name or "", entry(), group.model_copy(update=alone))
+
+
+def _applicable(written: notation.Written, task: Task, settings: Sequence[Setting]) -> list[Setting]:
+    """Return the settings for options that an entry has."""
+    algorithm = registry.get(specs.AlgorithmSpec, written.algorithm or task.file.default_algorithm)
+    model = registry.get(specs.ModelSpec, written.model)
+    sides = option_sides(task, algorithm, model, [*written.settings, *settings])
+    return [setting for setting in settings if _has(sides, setting)]
 
 
 def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:

@@ -8,6 +8,7 @@ observations, a model that says nothing).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -96,14 +97,15 @@ def available(meminfo: Path = Path("/proc/meminfo")) -> int | None:
 def require(entry: Entry, groups: Sequence[Sequence[int]], workers: int, free: int | None) -> None:
     """Refuse groups of seeds if `workers` of them do not fit into `free` bytes at once; None: unknown."""
     sizes = sorted((len(group) for group in groups), reverse=True)[:workers]
-    needed = sum(group_bytes(entry, size) for size in sizes)
+    bytes_of = functools.cache(functools.partial(group_bytes, entry))
+    needed = sum(map(bytes_of, sizes))
     if free is None or needed <= free:
         return
     fits = [
         (each * processes, processes)
         for processes in range(1, len(sizes) + 1)
         for each in range(1, sizes[0] + 1)
-        if processes * group_bytes(entry, each) <= free
+        if processes * bytes_of(each) <= free
     ]
     if fits:
         seeds, processes = max(fits)

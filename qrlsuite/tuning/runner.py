@@ -116,13 +116,13 @@ def _run(
 
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
-        missing.require_same_code(runs / FOLDER, entries, where, display.console.quiet)
+        computed = missing.require_same_code(runs / FOLDER, entries, where, display.console.quiet)
         missing.require_trainable(entries, where)
         works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
-        for work in works:
+        for work, code in zip(works, computed):
             missing.check_memory(work, where)
             store = EntryStore.create(work.runs, work.entry)
-            codes.prepare(store, identity.of(work.entry), identity.plugins(work.entry))
+            codes.prepare(store, code, identity.plugins(work.entry))
             trained += len(work.todo)
         display.begin_trials(works)
         for together in where.divide(works):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +26,7 @@ from qrlsuite.cli.training import (
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.task import load
 from qrlsuite.notation import Written, parse_entry, split, write_setting
 
 QUICK_SEEDS = 8
@@ -137,7 +139,7 @@ def run(
 
 def _of_its_size(circuit: Entry, task: str, written: Written, words: list[str], runs: Path) -> str:
     """Return a line that says how to train the network to which a circuit is compared."""
-    from qrlsuite.population import remembers  # torch is slow to import
+    from qrlsuite.population import count_parameters, remembers  # torch is slow to import
     from qrlsuite.studies.sizes import nearest_size, parameters
     from qrlsuite.training.trainer import first_network
 
@@ -149,14 +151,16 @@ def _of_its_size(circuit: Entry, task: str, written: Written, words: list[str], 
         )
     )
     kept = tuple(s for s in (*learning, *world) if s.name != "quantum_lr")
-    model = "gru" if remembers(first_network(circuit)) else "mlp"
+    first, loaded = first_network(circuit), load(task)
+    model = "gru" if remembers(first) else "mlp"
 
+    @functools.cache
     def network(width: int) -> Entry:
         width_of = options.Setting("model", "width", width)
-        return resolve(task, Written(model, written.algorithm, (*kept, width_of), written.preset))
+        return resolve(loaded, Written(model, written.algorithm, (*kept, width_of), written.preset))
 
     found = network(nearest_size(network, circuit))
-    counts = f"{parameters(found)} parameters, the circuit has {parameters(circuit)}"
+    counts = f"{parameters(found)} parameters, the circuit has {sum(count_parameters(first))}"
     entry = [*split(found.label), *(write_setting(f"environment.{s.name}", s.value) for s in world)]
     return f"a network of its size ({counts}): {command('run', *entry, '--task', task, *words, runs=runs)}"
 
