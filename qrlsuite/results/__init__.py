@@ -1,1 +1,1 @@
-"""What is on disk: results folders, checkpoints and claims, and what can be read from them."""
+"""Results on disk: folders, checkpoints, claims, and readers of them."""

@@ -29,7 +29,7 @@ FILE = "checkpoint.safetensors"  # in the group's folder
 
 @dataclass(frozen=True)
 class Header:
-    """Where a checkpoint lies and what it holds."""
+    """A checkpoint's path and content."""
 
     path: Path
     epoch: int
@@ -43,7 +43,7 @@ def group_id(seeds: Sequence[int]) -> str:
 
 
 def save(store: EntryStore, seeds: Sequence[int], epoch: int, arrays: Mapping[str, NDArray[Any]]) -> Header:
-    """Write a group's checkpoint and remove those that it supersedes.
+    """Write a group's checkpoint and remove the checkpoints that it supersedes.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def _remove_superseded(store: EntryStore, newest: Header) -> None:
 
 
 def headers(store: EntryStore) -> list[Header]:
-    """Return what every group's checkpoint holds, without reading its tensors."""
+    """Return the header of every group's checkpoint; tensors are not read."""
     if not store.groups.is_dir():
         return []
     headers_found = []

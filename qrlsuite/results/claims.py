@@ -2,9 +2,9 @@
 
 A claim is a file with machine, process and seeds. Its holder refreshes the file's time every few seconds. On the
 holder's own machine, known by host name, boot and installation, a claim lives exactly as long as the process. Elsewhere
-it is suspect when the file system's own clock says that it was not refreshed for `ABANDONED` seconds, or will only be
-refreshed in the future; that clock may have jumped, so a suspect claim is then watched for `WATCH` seconds of this
-process's monotonic clock, and taken over only if nobody refreshes it meanwhile.
+it is suspect when, by the file system's clock, it was not refreshed for `ABANDONED` seconds, or was refreshed in the
+future. That clock may have jumped. So a suspect claim is watched for `WATCH` seconds of this process's monotonic clock,
+and taken over only if nobody refreshes it meanwhile.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Claim:
 
 
 def _process_start(pid: int) -> str | None:
-    """Return when a process started, which tells it from a later one with the same number; None if it is gone."""
+    """Return when a process started; a later process of that number started later. None if no such process runs."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):
@@ -120,10 +120,10 @@ def _process_start(pid: int) -> str | None:
 
 @functools.cache
 def _machine() -> str:
-    """Return what tells machines of one host name apart: this boot and the installation; "" where neither is known.
+    """Return the ids of this boot and this installation, which differ between machines of one host name; "" if unknown.
 
-    Process numbers mean something else after a boot, and the namespace of a machine's own processes has the same number
-    on every Linux.
+    A boot id is needed since process numbers begin anew with each boot. The process namespace of a machine itself does
+    not help: its number is equal on every Linux.
     """
     parts = []
     for path in ("/proc/sys/kernel/random/boot_id", "/etc/machine-id"):
@@ -133,7 +133,7 @@ def _machine() -> str:
 
 
 def _namespace() -> str:
-    """Return what tells containers of one host apart: in each, process numbers mean something else."""
+    """Return the process namespace, which differs between containers of one host, as their process numbers do."""
     try:
         return os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -149,9 +149,9 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def living(store: EntryStore) -> list[Claim]:
-    """Return the claims whose holders are alive, or may be: suspect ones are not watched.
+    """Return the claims whose holders are or may be alive: suspect claims are included and not watched.
 
-    Works in a folder that cannot be written, too.
+    A folder that cannot be written is read, too.
     """
     now = _file_system_time(store.claims)
     return [claim for claim in claims(store) if _state(claim, now) != "dead"]
@@ -207,7 +207,7 @@ def _state(claim: Claim, now: float) -> Literal["alive", "suspect", "dead"]:
 
 
 def _abandoned(suspects: Sequence[Claim]) -> list[Claim]:
-    """Watch suspect claims, all at once; returns those that nobody refreshed."""
+    """Watch suspect claims, all at once; returns the claims that nobody refreshed."""
     seen = {claim: _refreshed(claim) for claim in suspects}
     deadline = time.monotonic() + WATCH
     while seen and time.monotonic() < deadline:
@@ -232,12 +232,12 @@ def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
 
 
 def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Claim | SeedsClaimedError]:
-    """Claim groups of seeds for this process, each on its own; a thousand take one look at what is claimed already.
+    """Claim groups of seeds for this process, each group by itself; existing claims are read once for all groups.
 
     Returns
     -------
     list
-        For each group its claim, or the error that `acquire` raises where a living worker holds one of its seeds.
+        The claim of each group, or the error that `acquire` raises if a living worker holds one of its seeds.
     """
     wanted = {seed for seeds in groups for seed in seeds}
     try:
@@ -260,7 +260,7 @@ def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Cla
 def _acquire_free(
     store: EntryStore, seeds: Sequence[int], held: Mapping[int, Claim]
 ) -> Claim | SeedsClaimedError:
-    """Write a claim of seeds, unless one of them is held."""
+    """Write a claim of seeds, unless another claim holds one of the seeds."""
     for seed in seeds:
         if seed in held:
             holder = held[seed]

@@ -1,8 +1,8 @@
-"""The code identities of an entry's seeds: which of them are one entry, and what to do where the code has changed.
+"""The code identities of an entry's seeds: which seeds make one entry, and the ways on after the code has changed.
 
-`run.json` has the identity of the code that began a seed under `code`, `entry.json` that of the code that trains now.
-Seeds from before identities were recorded have none: they are those of the suite's first bits, or of a plugin's code
-that nobody knows. What an author declared to be the same in effect stands in `entry.json` under `same`.
+Under `code`, `run.json` has the identity of the code that began the seed, and `entry.json` that of the code that trains
+now. Older seeds have no identity: they were made by the suite's first version, or by unknown code of a plugin. Codes
+that an author declared to be equal in effect stand in `entry.json` under `same`.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ class ChangedCodeError(StoreError):
 
 @dataclass(frozen=True)
 class SameCode:
-    """Seeds of one code, or of several that were declared to be the same.
+    """Seeds of one code, or of several codes that were declared to be equal in effect.
 
     Attributes
     ----------
     codes:
-        Identities by digest, in the order of the seeds; None where nothing was recorded.
+        Identities by digest, in the order of the seeds; None if no identity was recorded.
     """
 
     seeds: tuple[int, ...]
@@ -58,7 +58,7 @@ class SameCode:
 
     @property
     def mark(self) -> str:
-        """Eight digits that tell these seeds from others of the entry; zeros where the code of none is known."""
+        """Eight digits that identify the code of these seeds; zeros if it is unknown."""
         return next(filter(None, self.codes), "0" * 8)[:8]
 
 
@@ -103,9 +103,9 @@ def environments(codes: Iterable[CodeIdentity | None]) -> frozenset[str]:
 
 
 def of_seeds(store: EntryStore) -> list[SameCode]:
-    """Return an entry's seeds by their code, those of one code first that the lowest seed has.
+    """Return an entry's seeds by their code; the code of the lowest seed comes first.
 
-    A seed of which no epoch was finished is left out: any code may begin it anew.
+    A seed without a finished epoch is left out: any code may begin it anew.
     """
     seeds: dict[str, list[int]] = {}
     codes: dict[str, CodeIdentity | None] = {}
@@ -134,7 +134,7 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
 
 
 def _declared(store: EntryStore) -> list[list[str]]:
-    """Return the digests that were declared to be the same, one list for each declaration."""
+    """Return the digests that were declared to be equal in effect, one list for each declaration."""
     said = store.record().get("same", [])
     if not isinstance(said, list) or not all(
         isinstance(one, dict)
@@ -147,7 +147,7 @@ def _declared(store: EntryStore) -> list[list[str]]:
 
 
 def _alike(codes: Mapping[str, CodeIdentity | None], declared: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Divide digests into those that stand for the same code, in their order."""
+    """Group digests of equal code, in their order."""
     first = next((digest for digest, code in codes.items() if code is not None and code.original), None)
     links = [*declared, *([[UNKNOWN, first]] if first is not None and UNKNOWN in codes else [])]
     groups: list[set[str]] = []
@@ -219,12 +219,12 @@ def require_installed(store: EntryStore, seeds: Collection[int], current: CodeId
 
 
 def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> None:
-    """Refuse to put seeds of one code to those of another.
+    """Refuse to merge seeds of different code.
 
     Parameters
     ----------
     store:
-        Where the seeds are to go; it need not exist.
+        Destination of the seeds; it need not exist.
     exported:
         Whether `source` is an exported entry, whose record has its code.
     """
@@ -250,7 +250,7 @@ def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> 
 
 
 def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
-    """Refuse to train an entry here with another code than that of whoever started it."""
+    """Refuse to train an entry on this machine with other code than the machine that started it has."""
     path = store.path / "entry.json"
     sent = read(store.record(), path) if path.exists() else None
     if sent is None:
@@ -300,9 +300,9 @@ def _kept(store: EntryStore, record: Mapping[str, Any]) -> Mapping[str, list[str
 
 
 def contents(record: Mapping[str, Any], digests: Iterable[str]) -> dict[str, frozenset[str]]:
-    """Return which contents of plugins by path belong to some codes of an entry, by the plugin's file name.
+    """Return the contents of plugins by path that belong to some codes of an entry, by the plugin's file name.
 
-    What a damaged record says of copies is left out: nothing is opened by it.
+    Malformed names of copies in a damaged record are left out; none of them is opened.
     """
     kept, found = record.get("plugins"), dict[str, set[str]]()
     places = [kept.get(digest, []) for digest in digests] if isinstance(kept, dict) else []
@@ -346,9 +346,9 @@ def copies(store: EntryStore) -> list[Path]:
 
 
 def load_plugins(path: str | os.PathLike[str]) -> list[own.Loaded]:
-    """Load a plugin's file or folder; of an entry's folder, the copies with which the entry is trained.
+    """Load a plugin's file or folder; for an entry's folder, load the copies with which the entry is trained.
 
-    Nothing else imports what lies in a results folder: to read an entry never does.
+    Nothing else imports code from a results folder: reading an entry never does.
     """
     store = EntryStore(Path(path))
     if not (store.path / "entry.json").is_file():
@@ -374,7 +374,7 @@ def load_copies(store: EntryStore) -> list[own.Loaded]:
 
 
 def declare_same(store: EntryStore, current: CodeIdentity, reason: str) -> None:
-    """Record its author's word that an entry's seeds of another code and this code do the same."""
+    """Record the author's word that this code and the other codes of an entry's seeds are equal in effect."""
     if not reason.strip() or not reason.isprintable():
         raise OptionError(
             "--same: say in one line why nothing changed in effect, for example --same 'renamed'"

@@ -1,7 +1,7 @@
-"""Folders are what they say: a seed's folder is that seed's, and no seed is another one's copy.
+"""Checks that folders are genuine: a seed's folder holds that seed, and no seed is a copy of another.
 
-Folders are copied, linked and renamed, by hand and by scripts, and results folders come from others. What is read from
-them is checked here against what they say of themselves.
+Folders are copied, linked and renamed, by hand and by scripts, and results folders come from others. Here their
+content is checked against their names and records.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from qrlsuite.results.store import EntryStore, SeedRun
 
 _CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff]")
-"""All but tabs and line feeds; of the marks that reverse the direction of writing, those that do so by force."""
+"""Control characters except tabs and line feeds, and the marks that force a direction of writing."""
 
 
 def require_no_link(*paths: Path) -> None:
@@ -49,7 +49,7 @@ def require_plain(path: Path | str, content: object) -> None:
 
 
 def require_entry(record: Mapping[str, Any]) -> None:
-    """Refuse an entry's record whose hashes and name do not stand for what it says was run."""
+    """Refuse an entry's record whose hashes or name do not follow from its own content."""
     identity = record["identity"]
     if not isinstance(identity.get("task"), dict):
         raise ValueError("the task is not a table")
@@ -83,11 +83,11 @@ def require_seed(folder: Path, seed: int, record: Mapping[str, Any], names: Mapp
 
 
 def copies(store: EntryStore, runs: Sequence[SeedRun]) -> Iterator[tuple[int, ...]]:
-    """Yield the seeds that are copies of each other: no two seeds learn the same by chance.
+    """Yield groups of seeds that are copies of each other: no two seeds have equal curves by chance.
 
-    Seeds of equal scores are, unless their curves have two values or fewer: agents that never learn, and those that
-    solve a deterministic task at a blow, may coincide. These are copies where their trained parameters are equal, and
-    finite: of two agents whose parameters are not numbers, all are.
+    Equal curves of three values or more are copies. Curves of fewer values may coincide: agents never learn, or solve a
+    deterministic task at once. Such seeds are copies if their trained parameters are equal and finite: equal NaN prove
+    nothing.
     """
     equal: dict[bytes, list[SeedRun]] = {}
     for run in runs:

@@ -1,4 +1,4 @@
-"""Finds entries by name, label or hash, or by the beginning of one of them."""
+"""Finds entries by name, label or hash, or by the beginning of a name, label or hash."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def task_name(runs: Path, task: str | None) -> str | None:
 
 
 def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> list[str]:
-    """Return the names of tasks: as they are written, or that of `gym:ID` or of the task file whose path is written.
+    """Return the names of tasks that are given by name, as `gym:ID`, or by the path of a task file.
 
     Parameters
     ----------
@@ -106,14 +106,14 @@ def definitions(tasks: Iterable[str]) -> dict[str, str]:
 
 
 def choose(among: Sequence[N], name: str, searched: object) -> N:
-    """Return the one entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
+    """Return the entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
 
-    Where several tasks have such an entry, `TASK/NAME` is one of them. A whole name goes before a beginning.
+    If several tasks have such an entry, `TASK/NAME` selects one. A whole name goes before a beginning.
 
     Parameters
     ----------
     searched:
-        For the message: the folder that was looked into.
+        The searched folder, for the message.
     """
     found = fitting(among, name)
     if not found:
@@ -166,7 +166,7 @@ def _name(task: str, written: notation.Written) -> str | None:
 
 
 def _same(written: notation.Written, label: str) -> bool:
-    """Return whether a label says the same, but for an algorithm that is not written."""
+    """Return whether a label means the written entry; the algorithm may be left out."""
     try:
         known = notation.parse_entry(label)
     except OptionError:  # of a folder that is damaged, or put aside
@@ -191,13 +191,13 @@ def _short(entry: Named) -> str:
 
 
 def _names(entry: Named) -> tuple[str, ...]:
-    """Return what an entry answers to."""
+    """Return every name by which an entry can be found."""
     plain = (entry.name, entry.label, _short(entry), entry.name.rpartition("-")[2])
     return (*plain, *(f"{entry.task}/{name}" for name in plain))
 
 
 def _choices(entries: Sequence[Named], among: Sequence[Named]) -> str:
-    """List what to type for some entries: the label, with task or hash where several among all have that label."""
+    """List unique names of some entries: the label, with task or hash if several entries have that label."""
     labels = Counter(e.label for e in among)
     places = Counter((e.task, e.label) for e in among)
     choices = []

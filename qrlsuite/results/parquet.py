@@ -1,11 +1,11 @@
-"""Reads parquet files of others: how much one decodes to is counted before any of it is decoded.
+"""Reads parquet files of others: the decoded size of a file is computed before anything is decoded.
 
 A few bytes can stand for billions of values: a value is repeated by its count, a page is packed, a text is named by its
-place in a dictionary. Here the file's footer and the head of every page are read, which is all that says how much there
-is, and a file that holds too much is refused. What the footer says of the pages is not believed. Only then pyarrow
-decodes, and it decodes no more than the pages' heads say.
+place in a dictionary. Here the file's footer and the head of every page are read, since these alone state sizes, and a
+file that holds too much is refused. The footer's statements about pages are not believed. Only then pyarrow decodes,
+and it decodes no more than the pages' heads state.
 
-Both are written in Thrift's compact protocol, see
+Footer and heads are written in Thrift's compact protocol, see
 https://github.com/apache/parquet-format/blob/master/src/main/thrift/parquet.thrift.
 """
 
@@ -35,7 +35,7 @@ _DICTIONARY_PAGE = 2
 _DESCRIBED = {0: (5, 2), _DICTIONARY_PAGE: (7, 2), 3: (8, 4)}
 """Field of a page's head that describes its values, and field in it with their encoding, by the page's type."""
 _ENCODINGS = (0, 2, 3, 8)
-"""Plain, by dictionary, by run length: in others a text may be a part of the one before, and again."""
+"""Plain, by dictionary, by run length. In other encodings a text may repeat parts of the text before it."""
 
 
 def read(path: Path, values: int = MOST_VALUES) -> pyarrow.Table:
@@ -62,7 +62,7 @@ def read(path: Path, values: int = MOST_VALUES) -> pyarrow.Table:
 
 
 class _Damaged(Exception):
-    """The file is not what the format says."""
+    """The file does not follow the format."""
 
 
 def _decoded(content: bytes) -> int:

@@ -1,8 +1,8 @@
 """Points of learning curves that other programs wrote: csv files, tables, arrays, and the files of `run_files`.
 
 Points are the environment steps and scores of the runs of entries. A csv file or a table names entry and seed in every
-row. Other files hold a run each, and its path names it: the run's number is the seed, and what differs between the
-paths of several runs is the entry. `logs/small/seed-3/evaluations.npz` is seed 3 of `small`.
+row. Other files hold one run, named by the path: the run's number is the seed, and the words that differ between paths
+are the entry. `logs/small/seed-3/evaluations.npz` is seed 3 of `small`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     "seed": ("run", "run_id", "trial"),
     "step": ("steps", "timestep", "timesteps", "total_timesteps", "env_step", "env_steps", "global_step"),
 }
-"""What others call these columns. What the score is, only who has them knows: it is `score`, or named."""
+"""Other programs' names of these columns. The score has no synonyms: its column is `score`, or the user names it."""
 
 Run = tuple[str, int]
 """An entry's name and a seed."""
@@ -44,7 +44,7 @@ _LONGEST_NAME = 80
 
 @dataclass(frozen=True)
 class Points:
-    """What was observed of one run.
+    """The observed points of one run.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Points:
     scores:
         (K,) float64, finite.
     source:
-        Where they were read, for messages.
+        Source of the points, for messages.
     """
 
     steps: NDArray[np.int64]
@@ -62,7 +62,7 @@ class Points:
 
 
 class _Rows:
-    """Collects points of runs, and refuses what is not a curve."""
+    """Collects points of runs, and refuses points that make no curve."""
 
     def __init__(self) -> None:
         self._runs: dict[Run, tuple[array.array[int], array.array[float], str]] = {}
@@ -127,13 +127,13 @@ def _require_run(entry: str, seed: int, source: str) -> None:
 
 
 def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Points]:
-    """Read files of one kind or of several.
+    """Read files of one or several kinds.
 
     Parameters
     ----------
     metric:
-        What the score is called: a column of csv files (default: `score`), a scalar of TensorBoard or W&B (default:
-        the first of `run_files.METRICS` that is there).
+        Name of the score: a column of csv files (default: `score`), a scalar of TensorBoard or W&B (default: the first
+        of `run_files.METRICS` in the file).
 
     Returns
     -------
@@ -169,9 +169,9 @@ def read_table(table: Any, metric: str | None = None) -> dict[Run, Points]:
     Parameters
     ----------
     table:
-        What `pyarrow.table` takes: a table, a data frame of pandas or polars.
+        Anything that `pyarrow.table` takes: a table, a data frame of pandas or polars.
     metric:
-        The column that is the score.
+        The column of the score.
     """
     try:
         arrow = table if isinstance(table, pyarrow.Table) else pyarrow.table(table)

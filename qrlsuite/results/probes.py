@@ -1,4 +1,4 @@
-"""What probes of independent seeds found, as `run.json` has it under `probe`; `qrlsuite.engine.probe` makes them."""
+"""Results of probes of independent seeds, stored in `run.json` under `probe`; `qrlsuite.engine.probe` makes them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def of_entry(store: EntryStore) -> list[dict[str, Any]]:
 
 
 def sentence(probe: Mapping[str, Any]) -> str:
-    """Say what a probe has found that did not end the run, and what it took."""
+    """Describe the result and the cost of a probe that did not end the run."""
     if probe["result"] != EQUAL:
         return f"not probed: {probe.get('reason')}"
     return (
@@ -53,14 +53,14 @@ def third_party(made_with: Mapping[str, Any]) -> bool:
 
 
 def require_independent(store: EntryStore) -> None:
-    """Refuse to go on with an entry of which a probe has found that its seeds depend on each other."""
+    """Refuse to go on with an entry whose seeds depend on each other, by a probe's result."""
     for probe in of_entry(store):
         if probe["result"] == DIFFERS:
             raise refusal(store, probe)
 
 
 def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
-    """Return the error that says how the seeds of an entry depend on each other, why that may be, and what to type."""
+    """Return the error for seeds that depend on each other: how they do, likely causes, and the command to type."""
     identity = store.record()["identity"]
     kind = specs.AlgorithmSpec if identity["model"] == specs.NO_MODEL else specs.ModelSpec
     name = str(identity[kind.kind])

@@ -30,9 +30,9 @@ class Progress:
     seed_diverged: list[bool] = field(default_factory=list)
     """Whether numbers of each seed's agent are no longer finite after `epoch`."""
     epoch_seconds: float | None = None
-    """Of the last epoch; None for the first one of a process, which holds what happens once."""
+    """Seconds of the last epoch; None for a process's first epoch, which includes its start."""
     warnings: list[str] = field(default_factory=list)
-    """What the user should know although nothing failed: a tracker that was left out."""
+    """Warnings for the user although nothing failed: for example, a tracker was left out."""
 
     def finished_epoch(self, epoch: int, seed_scores: list[float], seed_diverged: list[bool]) -> None:
         """Take in that an epoch has finished, with every seed's score after it and whether it has diverged."""
@@ -43,8 +43,8 @@ class Progress:
 class ProgressFile:
     """A group's progress on disk, read by any display.
 
-    Its worker writes it at most twice a second, and always before what may take long in silence: at the last round of
-    an epoch's training, for PPO and REINFORCE learn when all rounds are played, and where it waits for a probe.
+    Its worker writes it at most twice a second, and always before a long silent step: at the last round of an epoch's
+    training, since PPO and REINFORCE learn after all rounds, and before it waits for a probe.
     """
 
     def __init__(self, store: EntryStore, group: str) -> None:

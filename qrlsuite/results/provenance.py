@@ -36,14 +36,14 @@ Where all are set alike, the name of the processor does not count, see `qrlsuite
 
 
 def collect(distributions: Sequence[str], device: torch.device | None = None) -> dict[str, Any]:
-    """Return versions, device, processor, threads, git commit, and by which variables instruction sets were fixed.
+    """Return versions, device, processor, threads, git commit, and the variables that fixed instruction sets.
 
     Parameters
     ----------
     distributions:
-        Further distributions whose versions matter: those of the plugins in use.
+        Further distributions whose versions matter: the distributions of the plugins in use.
     device:
-        What the models are trained on; the processor by default.
+        The device that trains the models; the processor by default.
     """
     versions = {name: version(name) for name in [*PACKAGES, *distributions]}
     return {
@@ -60,14 +60,14 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
 
 
 def of(entry: Entry, device: torch.device | None = None) -> dict[str, Any]:
-    """Return what `collect` returns of an entry, and the `numerics` of its parts that are the suite's, by role."""
+    """Return `collect` of an entry's distributions, and the `numerics` of the suite's own parts, by role."""
     return {**collect(entry.distributions(), device), "numerics": identity.numerics(entry)}
 
 
 def version(distribution: str) -> str | None:
-    """Return the version of a distribution, None if it is not installed; of this suite, that of the code that runs.
+    """Return the version of a distribution, None if it is not installed; for this suite, the running code's version.
 
-    What an editable installation says of itself is as old as the installation.
+    The version in an editable installation's metadata is as old as the installation.
     """
     if distribution == "qrlsuite":
         return qrlsuite.__version__
@@ -78,13 +78,13 @@ def version(distribution: str) -> str | None:
 
 
 def device_kind(made_with: Mapping[str, Any]) -> str:
-    """Return the kind of device (`cpu`, `cuda`) of what `collect` returned; before it was recorded, read as `cpu`."""
+    """Return the kind of device (`cpu`, `cuda`) in a result of `collect`; `cpu` in old records, which name none."""
     device = made_with.get("device")
     return str(device.get("kind", "cpu")) if isinstance(device, Mapping) else "cpu"
 
 
 def records(made_with: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the record of a published seed's last epochs, and those of earlier ones that were made otherwise."""
+    """Return the record of a published seed's last epochs, and records of earlier epochs that were made otherwise."""
     before = made_with.get("before")
     return [
         made_with,
@@ -110,7 +110,7 @@ def texts(made: Iterable[Mapping[str, Any]], name: str) -> tuple[str, ...]:
 
 
 def devices(made: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return every kind of device that occurs (`cpu`, `cuda`), sorted; what names none was trained on the CPU."""
+    """Return every kind of device that occurs (`cpu`, `cuda`), sorted; a record that names none means the CPU."""
     return tuple(sorted({device_kind(origin) for origin in made}))
 
 
@@ -152,10 +152,10 @@ def _commit() -> str | None:
 
 
 def commit_of(package: Path) -> str | None:
-    """Return the commit of the working copy whose top holds a package, with `-dirty` where a file of it was changed.
+    """Return the commit of the working copy whose top holds a package, with `-dirty` if a file was changed.
 
-    None where there is no such working copy, or git cannot tell. A repository that merely has the package somewhere
-    below it, in a virtual environment say, or does not track it, is somebody else's.
+    None if there is no such working copy, or git fails. A repository that does not track the package, or has it further
+    below (in a virtual environment, say), does not count.
     """
     if not (package.parent / ".git").exists():
         return None

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from qrlsuite.errors import FileError, listed
 
 METRICS = ("eval/mean_reward", "rollout/ep_rew_mean", "charts/episodic_return", "score")
-"""Scalars that are read as the score, the first of them that a file has, where none is named: those of
-Stable-Baselines3's evaluations and training, and of CleanRL."""
+"""Names of the score in Stable-Baselines3's evaluations and training, and in CleanRL. If the user names no scalar, the
+first of these names in a file is read."""
 
 MOST_BYTES = 1_000_000_000
 """Bytes of a file that is read at once, packed or unpacked, at most."""
@@ -53,7 +53,7 @@ Curve = Iterable[tuple[int, float]]
 
 
 def below(folder: Path) -> str:
-    """Say how to import the curves of other programs below a folder; empty where there are none."""
+    """Return the command that imports the curves of other programs below a folder; empty if there are none."""
     paths = [path.relative_to(folder) for path in itertools.islice(folder.rglob("*"), _MOST_PATHS)]
     shown = [path for path in paths if not any(part.startswith(".") for part in path.parts)]
     for name in _CURVES:
@@ -93,10 +93,10 @@ def holds_one_run(path: Path) -> bool:
 
 
 def words(path: Path) -> tuple[str, ...]:
-    """Return what names the run of a file: words that may name its entry, and at last the run's own name.
+    """Return the words that name the run of a file: words that may name its entry, and last the run's own name.
 
-    These are the folders of its path, and the last of them is the run, unless the file has a name of its own. W&B's
-    files say project, group and name, and may have the seed in their configuration.
+    The words are the folders of the path. The last folder names the run, unless the file itself does. W&B's files state
+    project, group and name, and may have the seed in their configuration.
     """
     if _kind(path) is _wandb:
         return _words_of_wandb(path)
@@ -125,7 +125,7 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
 
 
 def _kind(path: Path) -> Callable[[Sequence[Path], str | None], Curve] | None:
-    """Return what reads a file of one run, None for any other."""
+    """Return the reader of a file of one run, None for any other file."""
     name = path.name
     if ".tfevents." in name:
         return _tensorboard
@@ -215,7 +215,7 @@ def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
 
 
 def _progress(paths: Sequence[Path], metric: str | None) -> Curve:
-    """Return a scalar of what Stable-Baselines3's logger wrote to csv; a row may lack some of the scalars."""
+    """Return a scalar from a csv file of Stable-Baselines3's logger; a row may lack some scalars."""
     found: dict[str, dict[int, float]] = {}
     for path in paths:
         content = cells_of(path, lines_of(path))
@@ -281,7 +281,7 @@ def _require_size(stream: io.BytesIO, length: int, source: str) -> None:
 
 
 def _tensorboard(paths: Sequence[Path], metric: str | None) -> Curve:
-    """Return a scalar of event files; of one step, what was written last."""
+    """Return a scalar of event files; the last written value of a step counts."""
     _require_installed("tensorboard", paths[0])
     found: dict[str, dict[int, float]] = {}
     for path in sorted(paths, key=lambda path: path.name):

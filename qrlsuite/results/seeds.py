@@ -21,7 +21,7 @@ LONGEST_RANGE = 36
 
 @dataclass(frozen=True)
 class SeedGroup:
-    """Seeds that are at the same epoch and are trained together."""
+    """Seeds at one epoch that are trained together."""
 
     seeds: tuple[int, ...]
     epoch: int
@@ -50,7 +50,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def read_seeds(requested: int | str | Iterable[int]) -> list[int]:
-    """Return the seeds that are meant by a number (100: seeds 0 to 99), text as in `parse_seeds`, or the seeds."""
+    """Return the seeds of a number (100: seeds 0 to 99), of a text as in `parse_seeds`, or of a sequence of seeds."""
     if isinstance(requested, str):
         return parse_seeds(requested)
     if _is_seed(requested):

@@ -1,13 +1,13 @@
 """Estimates training time on this machine, from measured epochs and reference measurements.
 
-A speed is the time of one epoch of one seed, training and validation, on one core, as its share of the group that
-it was trained in. That share depends on the size of the group: a small network alone takes thirty times as long as
-in a group of fifty. So every estimate is for groups of a given size. It is a range, and says what it rests on:
+A speed is the time of one epoch of one seed, training and validation, on one core, as a share of its group's time.
+The share depends on the size of the group: a small network alone takes thirty times as long as in a group of fifty.
+So every estimate is for groups of a given size. It is a range, and names its basis:
 
 - `measured`: epochs of this very entry in this results folder, in groups of about this size;
-- `reference`: the most similar row of the reference table, to which belongs what was measured here in groups of about
-  this size; a row of another machine counts times the ratio of the two machines' calibrations (see `calibration`);
-- `unknown`: there is nothing to go by until a first epoch has been trained.
+- `reference`: the most similar row among the reference table and the entries measured here in groups of about this
+  size; a row of another machine is multiplied by the ratio of the two machines' calibrations (see `calibration`);
+- `unknown`: no basis until a first epoch has been trained.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore, entries, read_lines, write_atomically
 
 SAMPLED_SEEDS = 8
-"""Seeds of an entry whose timings are read; those of a group hardly differ."""
+"""Number of seeds of an entry whose timings are read; timings within a group hardly differ."""
 
 BASES = {
     "measured": "measured on its own epochs",
@@ -46,12 +46,12 @@ BASES = {
 Basis = Literal["measured", "reference", "unknown"]
 
 WITHIN: Mapping[Basis, float] = {"measured": 1.25, "reference": 3.0, "unknown": 1.0}
-"""An estimate ranges from what it says divided by this factor to what it says times it. For `reference`, it covers the
-distance between the reference speeds and the hours of all published entries (a test holds it to that). What was
-measured ranges at least this far, and as far as the 10th and 90th percentile of its epochs."""
+"""An estimate ranges from its value divided by this factor to its value times this factor. For `reference`, the range
+covers the hours of all published entries (a test checks it). For `measured`, the range also covers the 10th to the
+90th percentile of the epochs."""
 
 SAME_SIZE = 2.0
-"""Speeds measured in groups up to this many times larger or smaller count as measured in groups of the same size."""
+"""Groups up to this many times larger or smaller count as groups of one size."""
 
 CALIBRATION_FILE = "qrlsuite/speed.json"
 REPETITIONS, PRODUCTS = 5, 1500
@@ -59,14 +59,14 @@ REPETITIONS, PRODUCTS = 5, 1500
 
 @dataclass(frozen=True)
 class Speed:
-    """A speed and what it was measured on.
+    """A measured speed and its subject.
 
     Attributes
     ----------
     kind:
         Environment, algorithm and model: speeds of different kinds say nothing about each other.
     options:
-        Everything else that may matter, by name.
+        All other settings that may matter, by name.
     seconds:
         Seconds per seed and epoch on one core, in groups of `group` seeds.
     group:
@@ -74,9 +74,9 @@ class Speed:
     alone:
         Seconds per epoch of a seed that is trained alone; None where not known.
     calibration:
-        Of a reference: what `calibration()` is on its machine; None where not known.
+        Of a reference: the result of `calibration()` on its machine; None if unknown.
     within:
-        Of what was measured: the factor by which its epochs spread, from their 10th to their 90th percentile.
+        Of a measurement: the factor by which its epochs spread, from their 10th to their 90th percentile.
     """
 
     kind: tuple[str, str, str]
@@ -93,10 +93,10 @@ class Speed:
         return max(self.group / seeds, seeds / self.group) <= SAME_SIZE
 
     def together(self, seeds: int) -> float:
-        """Return the seconds per seed and epoch in a group of `seeds`, `seconds` where `alone` is not known.
+        """Return the seconds per seed and epoch in a group of `seeds`; `seconds` if `alone` is unknown.
 
-        An epoch of a group costs a fixed time, whatever its size, and a time for every seed: a seed's share of it in
-        a group of G is `fixed / G + own`. Two measurements, alone and in a group, give both.
+        An epoch costs a fixed time for the group and a time for every seed: a seed's share in a group of G seeds is
+        `fixed / G + own`. Two measurements, alone and in a group, give both.
 
         >>> speed = Speed(("beam6g", "ddqn", "mlp"), {}, 0.02, group=50, alone=0.51)
         >>> [round(speed.together(seeds), 3) for seeds in (1, 5, 50)]
@@ -110,7 +110,7 @@ class Speed:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Seconds per seed and epoch on one core, None where unknown, and what that rests on.
+    """Seconds per seed and epoch on one core, None if unknown, with their basis.
 
     The truth is expected between `seconds / within` and `seconds * within`.
     """
@@ -138,9 +138,9 @@ class _Row(options.Table):
 
 
 class SpeedFile(options.Table):
-    """A file of reference speeds: where they were measured, and one row per measurement.
+    """A file of reference speeds: the machine that measured them, and one row per measurement.
 
-    Without `calibration`, the speeds are taken as they are on every machine.
+    Without `calibration`, the speeds hold for every machine.
     """
 
     format_version: Literal[1]
@@ -157,7 +157,7 @@ def _calibrated() -> float:
 
 @dataclass
 class Speeds:
-    """What was measured in a results folder, and reference speeds.
+    """Speeds measured in a results folder, and reference speeds.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class Speeds:
         return Estimate(row.together(size or row.group) * machine, "reference", WITHIN["reference"])
 
     def note(self, store: EntryStore) -> None:
-        """Take in what an entry's folder has measured by now."""
+        """Read the timings of an entry's folder again."""
         measured = measure(store)
         if measured is not None:
             self.measured = [*(speed for speed in self.measured if speed.hash != measured.hash), measured]
@@ -232,7 +232,7 @@ def calibration() -> float:
     """Return the processor seconds of a fixed piece of work on this machine: measured once, in a second, and kept.
 
     It is kept per processor and version of the suite in `qrlsuite/speed.json`, in the folder that `QRLSUITE_CACHE`
-    names, else in the user's cache folder. What cannot be read there is measured anew.
+    names, else in the user's cache folder. If it cannot be read there, it is measured anew.
     """
     standard = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     path = Path(os.environ.get("QRLSUITE_CACHE") or standard).expanduser() / CALIBRATION_FILE
@@ -254,9 +254,9 @@ def calibration() -> float:
 def measure_calibration() -> float:
     """Return the median processor seconds of a fixed piece of work, over a few repetitions.
 
-    The work is what training small networks mostly is: 1500 times the products of 50 matrices (64, 32) with 50
-    matrices (32, 32), and the hyperbolic tangent of each, in float32 on one thread. The time is the thread's own, on
-    which other work on the machine has little influence.
+    The work resembles the training of small networks: 1500 times the products of 50 matrices (64, 32) with 50
+    matrices (32, 32), and the hyperbolic tangent of each, in float32 on one thread. The time is the thread's own: other
+    work on the machine has little influence.
     """
     times = []
     for _ in range(REPETITIONS):
@@ -270,10 +270,10 @@ def measure_calibration() -> float:
 
 
 def measure(store: EntryStore) -> Speed | None:
-    """Return the median speed of an entry's epochs, None where too little was timed (imported entries, for example).
+    """Return the median speed of an entry's epochs, None if too few were timed (imported entries, for example).
 
-    A seed's first epoch does not count: it holds the start of its process. Nor do small groups where there were larger
-    ones, for a seed alone takes many times its share of a group.
+    A seed's first epoch does not count: it includes the start of the process. Small groups do not count beside larger
+    ones: a seed alone takes many times its share of a group.
     """
     record = store.record()
     identity = record["identity"]
@@ -312,7 +312,7 @@ def _subject(entry: Entry) -> Speed:
 
 
 def _options(task: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what an entry's speed may depend on, by name; a list counts by its length."""
+    """Return the settings that an entry's speed may depend on, by name; a list counts by its length."""
     protocol = task["protocol"]
     values: dict[str, Any] = {
         name: protocol.get(name) for name in ("environments", "interactions", "validation_episodes")
@@ -327,9 +327,9 @@ def _options(task: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, 
 
 
 def _nearest(subject: Speed, known: Sequence[Speed]) -> Speed | None:
-    """Return the most similar speed of the same kind: few options differ, and numbers by a small ratio.
+    """Return the most similar speed of one kind: few options differ, and numbers by a small ratio.
 
-    Exact circuits say nothing about sampled or noisy ones, nor does one way to gradients about another: with the
+    Exact circuits say nothing about sampled or noisy circuits, nor one gradient method about another: with the
     parameter-shift rule an epoch takes a hundred times as long.
     """
     same = [

@@ -1,12 +1,12 @@
-"""The results on disk: the one source of truth, readable without this suite.
+"""Results on disk: the single source of truth, readable without this suite.
 
     runs/<task>/<entry>/entry.json              what was run: every option resolved
                         seed-0007/run.json      status, parameters, code identity, versions, machine
                                   epochs.jsonl  one line per epoch while the run goes on
-                                  epochs.parquet  the same once it has finished
+                                  epochs.parquet  all epochs once the run has finished
                                   timings.jsonl everything that may differ between two equal runs
                                   final.safetensors  the trained agent
-                        start/            agents with which seeds begin, of an entry that begins with some
+                        start/            agents with which seeds begin, if the entry begins with trained agents
                         groups/<id>/checkpoint.safetensors, progress.json
                         claims/<id>.json        who is working on which seeds
                 <entry>@1a2b3c4d/               seeds of other code (`qrlsuite.results.codes`)
@@ -57,7 +57,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content, or leave it as it is."""
+    """Replace a file's content as a whole, or leave the file unchanged."""
     try:
         with contextlib.suppress(FileExistsError):  # a file in the folder's place is named by the next line
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def cause(error: OSError) -> str:
-    """Say why a file could not be written, and on a full disk what frees some of it."""
+    """Return why a file could not be written and, on a full disk, a command that frees space."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     hint = " (to free some: qrlsuite runs gc --runs DIR, and DIR/tuning of searches)"
     return f"{error.strerror or error}{hint * full}"
@@ -175,7 +175,7 @@ def require_finite(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
 
 
 def drop_torn_line(path: Path) -> None:
-    """Remove what follows the last newline: the next line would be written behind it."""
+    """Remove the text after the last newline: the next line would be written behind it."""
     if path.exists():
         content = path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]
@@ -213,26 +213,26 @@ def round_means(means: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class SeedRun:
-    """What one seed's run holds so far.
+    """The content of one seed's run so far.
 
     Attributes
     ----------
     record:
-        `run.json`; empty where the run never began.
+        `run.json`; empty if the run never began.
     scores:
-        (T, validation episodes), one row per epoch; (T, 1), their means, of seeds that were imported from an export.
+        (T, validation episodes), one row per epoch; (T, 1), the means, for seeds imported from an export.
     seconds:
-        Core-seconds spent on it, see `SeedStore.seconds`.
+        Core-seconds spent on the run, see `SeedStore.seconds`.
     clocked:
-        Whether any of them are time by the clock, which other work on the same cores stretches.
+        Whether some of these seconds are by the clock, which other work on the cores stretches.
     executions:
         Circuit executions of training, gradients and validation together. A circuit that is sampled with many shots
         is executed once.
     diverged:
-        The first epoch after which numbers of the agent were not finite; None where they always were.
+        The first epoch after which numbers of the agent were not finite; None if they always were.
     measured:
-        By name, what the environment measured of every epoch's validation, means over its episodes (T,); NaN where it
-        did not.
+        Metrics of the environment by name: means over each epoch's validation episodes, (T,); NaN where it measured
+        none.
     """
 
     seed: int
@@ -317,8 +317,8 @@ class SeedStore:
         Parameters
         ----------
         decimals:
-            Whether scores are the shortest decimals, as in the lines; else those of the table are the float32 as they
-            are, which saves most of the time.
+            Whether scores are the shortest decimals, as in the lines. Otherwise scores of the table stay float32,
+            which saves most of the time.
         """
         rows = read_table(self.table, decimals) if self.table.exists() else []
         last = _epoch(rows[-1], self.table) if rows else 0
@@ -331,13 +331,13 @@ class SeedStore:
     def cut(self, epoch: int) -> int:
         """Drop every line newer than an epoch, and torn last lines; a table newer than it becomes lines again.
 
-        Where two workers wrote at once, lines may be there twice or be missing: the first of each epoch is kept, up to
-        the first that is missing.
+        If two workers wrote at once, lines may be doubled or missing: the first line of each epoch is kept, up to the
+        first missing epoch.
 
         Returns
         -------
         int
-            The number of epochs that are left: fewer than `epoch` where some are gone.
+            The number of remaining epochs: fewer than `epoch` if some are missing.
         """
         drop_torn_line(self.timings)
         rows = self._contiguous(epoch)
@@ -350,7 +350,7 @@ class SeedStore:
         return len(rows)
 
     def _contiguous(self, last: int) -> list[dict[str, Any]]:
-        """Return the record of each epoch from 1 to `last`, or to the one before the first that is missing."""
+        """Return the record of each epoch from 1 to `last`, or to the epoch before the first missing one."""
         by_epoch: dict[int, dict[str, Any]] = {}
         table = read_table(self.table, True) if self.table.exists() else []
         for path, rows in ((self.table, table), (self.lines, read_lines(self.lines))):
@@ -374,15 +374,15 @@ class SeedStore:
             self.lines.unlink(missing_ok=True)
 
     def seconds(self) -> float:
-        """Return the core-seconds spent on this seed's epochs so far: its share of its group's.
+        """Return the core-seconds spent on this seed's epochs so far: its share of the group's time.
 
-        Processor time where it was recorded (training on the CPU), which other work on the same cores does not
-        stretch; otherwise the time by the clock.
+        Processor time if it was recorded (training on the CPU), since other work on the cores does not stretch it;
+        otherwise time by the clock.
         """
         return self._timed()[0]
 
     def _timed(self) -> tuple[float, bool]:
-        """Return the core-seconds, and whether any of them are by the clock."""
+        """Return the core-seconds, and whether some of them are by the clock."""
         total, clocked = 0.0, False
         for line in read_lines(self.timings):
             clocked |= "cpu" not in line
@@ -394,7 +394,7 @@ class SeedStore:
         return total, clocked
 
     def read(self) -> SeedRun:
-        """Return what the run holds so far."""
+        """Return the content of the run so far."""
         rows = self.epochs(decimals=False)
         try:
             with np.errstate(over="ignore"):
@@ -462,9 +462,9 @@ def first_diverged(rows: Iterable[Mapping[str, Any]]) -> int | None:
 def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Return the trainable numbers of an entry's agents, from the `run.json` of its seeds.
 
-    They are `classical` and `quantum`, summed over `networks`: all that are trained; `fixed` are numbers of these
-    networks that stay as drawn, where there are some. Records without `networks` are of
-    older versions, which counted the first network alone; they stand only where no newer one is there.
+    `classical` and `quantum` are summed over all trained networks, `networks` in number; `fixed` counts numbers of
+    these networks that stay as drawn, if any. Records without `networks` are of older versions, which counted the first
+    network alone; they count only if there is no newer record.
     """
     per_run = [dict(record.get("parameters", {})) for record in records]
     whole = [counts for counts in per_run if "networks" in counts]
@@ -517,7 +517,7 @@ def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
-    """Read what `table_bytes` encoded.
+    """Read a table that `table_bytes` encoded.
 
     Parameters
     ----------
@@ -574,18 +574,18 @@ class EntryStore:
 
     @property
     def mark(self) -> str:
-        """What follows the entry's name where these seeds are of another code, `@1a2b3c4d`; else nothing."""
+        """The end of the folder's name if these seeds are of another code, `@1a2b3c4d`; else empty."""
         found = _MARK.search(self.path.name)
         return found[0] if found is not None and found.end() == len(self.path.name) else ""
 
     @classmethod
     def find(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:
-        """Return the entry's folder below a results folder, whether it is there or not.
+        """Return the entry's folder below a results folder, existing or not.
 
         Parameters
         ----------
         mark:
-            That of seeds of another code, which stand beside the entry's own.
+            Mark of seeds of another code, which lie beside the entry's own seeds.
         """
         store = cls(runs / entry.task.name / f"{entry.name}{mark}")
         genuine.require_no_link(store.path.parent, store.path)
@@ -595,11 +595,10 @@ class EntryStore:
 
     @classmethod
     def create(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:
-        """Return the entry's folder below a results folder, made if it is not there.
+        """Return the entry's folder below a results folder; create it if it does not exist.
 
-        Where the entry's settings are known to come from tuning, its record says so from now on; of two records
-        of tuning the one that took more steps stands; one that does not know its steps gives way to one that does.
-        `mark` is as for `find`.
+        If the entry's settings come from tuning, its record says so from now on. Of two records of tuning the one with
+        more steps stays; a record without steps gives way to one with steps. `mark` is as for `find`.
         """
         store = cls.find(runs, entry, mark)
         path = store.path / "entry.json"
@@ -640,7 +639,7 @@ class EntryStore:
 
     @functools.cached_property
     def names(self) -> dict[str, Any]:
-        """What each seed's record has to name: `entry`, `task`, `task_hash`; empty where `entry.json` is damaged."""
+        """Names that each seed's record must have: `entry`, `task`, `task_hash`; empty if `entry.json` is damaged."""
         try:
             record = read_json(self.path / "entry.json")
         except StoreError:
@@ -708,7 +707,7 @@ class EntryStore:
 
 
 def copies_of_plugins(store: EntryStore, record: Mapping[str, Any]) -> str:
-    """Say what to type for the copies of plugins that an entry has; nothing where it has none."""
+    """Return a hint how to load the copies of plugins in an entry's folder; empty if there are none."""
     kept = record.get("plugins")
     places = [str(place) for each in kept.values() for place in each] if isinstance(kept, dict) else []
     if not places:
@@ -718,12 +717,12 @@ def copies_of_plugins(store: EntryStore, record: Mapping[str, Any]) -> str:
 
 
 def plugins_in(runs: Path, unknown: str) -> str:
-    """Say what to type where an entry of a results folder has a copy of the plugin with an unknown name.
+    """Return a hint if an entry of a results folder has a copy of the plugin that registers an unknown name.
 
     Parameters
     ----------
     unknown:
-        The message that says it: the name stands in quotes.
+        The message about the unknown name, with the name in quotes.
     """
     name = unknown.partition("'")[2].partition("'")[0]
     for store in entries(runs) if runs.is_dir() else ():

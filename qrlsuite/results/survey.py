@@ -1,4 +1,4 @@
-"""Reads the state of a results folder: entries, seeds, groups, and checkpoints no longer needed."""
+"""Reads the state of a results folder: entries, seeds, groups, and checkpoints that nobody needs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json
 from qrlsuite.results.text import duration
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
-"""What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files or the queue know."""
+"""Statuses of a seed. `submitted`: handed to a queue and not begun, according to our files or the queue."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class EntrySurvey:
     seeds:
         Number of seeds by status.
     epochs:
-        Fewest and most epochs that a seed has recorded; None where none has begun.
+        Fewest and most epochs that a seed has recorded; None if no seed has begun.
     size:
         Bytes on disk.
     last_activity:
-        When anything in it was last written, seconds since 1970 by the file system's clock.
+        Time of the last write in the folder, seconds since 1970 by the file system's clock.
     problems:
-        What is damaged, one line each.
+        One line for each damaged file.
     """
 
     folder: Path
@@ -107,7 +107,7 @@ def outline(store: EntryStore) -> dict[str, Any]:
 def _seeds(
     store: EntryStore, problems: list[str], queued: Collection[int] | None
 ) -> tuple[dict[int, str], list[int]]:
-    """Return the status of every seed, and the epochs that those begun have recorded."""
+    """Return the status of every seed, and the numbers of recorded epochs of seeds that have begun."""
     held = {seed for claim in living(store) for seed in claim.seeds}
     statuses: dict[int, str] = {}
     for task in waiting(store, problems):
@@ -153,7 +153,7 @@ def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
 
 
 def submitted(store: EntryStore) -> list[dict[str, Any]]:
-    """Return what `waiting` returns."""
+    """Return the tasks of `waiting`; unreadable files are an error."""
     problems: list[str] = []
     tasks = waiting(store, problems)
     if problems:
@@ -238,7 +238,7 @@ class GroupStatus:
 
 
 def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[GroupStatus]:
-    """Return the groups of an entry that have not finished: those at work first, then waiting, then stopped.
+    """Return the unfinished groups of an entry: running groups first, then waiting, then stopped ones.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def _running(store: EntryStore, claim: Claim) -> GroupStatus:
 
 
 def _finished(store: EntryStore) -> tuple[set[int], set[int]]:
-    """Return the seeds that have finished, and those whose records cannot be read, which no run goes on with."""
+    """Return the finished seeds, and the seeds whose records cannot be read, which no run continues."""
     done, damaged = set(), set()
     for seed in store.seeds():
         try:
@@ -308,7 +308,7 @@ def garbage(runs: Path, task: str | None = None) -> tuple[list[Garbage], list[st
     Returns
     -------
     tuple
-        What can be removed, and one line for each entry that was left alone because it is damaged.
+        The removable checkpoints, and one line for each damaged entry, which is left alone.
     """
     unused: list[Garbage] = []
     problems: list[str] = []
@@ -326,7 +326,7 @@ def garbage(runs: Path, task: str | None = None) -> tuple[list[Garbage], list[st
 
 
 def remove(items: Sequence[Garbage]) -> int:
-    """Remove what `garbage` found, unless somebody began to extend it meanwhile; returns the bytes freed."""
+    """Remove the checkpoints that `garbage` found, unless a run has claimed their seeds; return the bytes freed."""
     freed = 0
     for item in items:
         try:
@@ -349,7 +349,7 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
     Parameters
     ----------
     runs:
-        The results folder. What links out of it is not touched.
+        The results folder. Targets of links out of it are not touched.
     queued:
         As for `look`.
     """
@@ -367,7 +367,7 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
 
 
 def require_movable(runs: Path, store: EntryStore, queued: Collection[int] | None = None) -> None:
-    """Refuse to move an entry's folder that is or lies beyond a link, or of which a queue has seeds.
+    """Refuse to move an entry's folder if it is or lies beyond a link, or if a queue has seeds of it.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ def steps_text(steps: float, position: object = None, digits: int = 4) -> str:
 
 
 def hours_text(hours: float) -> str:
-    """Write core-hours with two digits, large ones as whole numbers: 0.044, 1.2, 1,234."""
+    """Write core-hours with two digits, large numbers as whole ones: 0.044, 1.2, 1,234."""
     return f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
 
 
@@ -41,12 +41,12 @@ def duration(seconds: float) -> str:
 
 
 def duration_range(low: float, high: float) -> str:
-    """Write a range of time spans: 3 min to 27 min; one of them where both read the same."""
+    """Write a range of time spans: 3 min to 27 min; a single span if both read the same."""
     return " to ".join(dict.fromkeys(map(duration, (low, high))))
 
 
 def hours_range(low: float, high: float) -> str:
-    """Write a range of core-hours: 0.5 to 4.5; one of them where both read the same."""
+    """Write a range of core-hours: 0.5 to 4.5; a single number if both read the same."""
     return " to ".join(dict.fromkeys(map(hours_text, (low, high))))
 
 
