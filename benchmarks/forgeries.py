@@ -37,7 +37,7 @@ Curves = np.ndarray
 def entry(label: str) -> PublishedEntry:
     """Return a published entry of beam6g."""
     found = (published.read(path) for path in sorted(published.PUBLISHED.glob("beam6g/*")))
-    return next(each for each in found if each.record["label"] == label)
+    return next(each for each in found if each.record.label == label)
 
 
 HONEST = entry(WIDTH_16)

@@ -83,6 +83,7 @@ def task(given: argparse.Namespace) -> dict[str, Any]:
     from qrlsuite.experiment.entry import resolve
     from qrlsuite.options import parse_setting
     from qrlsuite.results import checkpoint
+    from qrlsuite.results.records import EntryRecord
     from qrlsuite.results.store import EntryStore
     from qrlsuite.training.remote_task import pack, unpack, work_on
 
@@ -90,7 +91,7 @@ def task(given: argparse.Namespace) -> dict[str, Any]:
     seeds, arrays, beside, size = list(range(given.seeds)), {}, [], 0
     header = {
         "token": "",
-        "entry": entry.record(),
+        "entry": EntryRecord.of(entry).content,
         "seeds": seeds,
         "seconds": 0,
         "device": "cpu",

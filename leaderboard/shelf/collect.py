@@ -384,9 +384,7 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         These alone; None for all.
     """
     record = store.record()
-    first = TaskFile.model_validate(record["task_file"])
-    task_file = current(first, record["task_name"], record["task_hash"])
-    runs, refused = _readable(store, task_file, seeds)
+    runs, refused = _readable(store, current(record), seeds)
     if not runs:
         if refused:
             raise StoreError("; ".join(refused))
@@ -394,7 +392,6 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
     made_by = [codes.read(run.record, store.seed(run.seed).path) for run in runs]
     entry = EntryResults.of_record(
         record,
-        first,
         store.path,
         {run.seed: run.curve for run in runs},
         {

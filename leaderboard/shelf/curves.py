@@ -21,6 +21,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.store import MEASURED
 from qrlsuite.results.text import counted
@@ -141,8 +142,7 @@ class EntryResults(Shown):
     @classmethod
     def of_record(
         cls,
-        record: Mapping[str, Any],
-        task_file: TaskFile,
+        record: EntryRecord,
         folder: Path,
         curves: Mapping[int, NDArray[np.float64]],
         records: Mapping[int, Mapping[str, Any]],
@@ -155,10 +155,6 @@ class EntryResults(Shown):
 
         Parameters
         ----------
-        record:
-            The content of `entry.json`.
-        task_file:
-            The task as the record holds it.
         curves:
             Each seed's curve (T,), of any lengths.
         parameters:
@@ -170,18 +166,17 @@ class EntryResults(Shown):
         records, facts:
             Attributes that stay as they are.
         """
-        identity, preset = record["identity"], record["preset"]
-        now = current(task_file, record["task_name"], record["task_hash"])
+        identity, now = record.identity, current(record)
         length = _common_length(records.values())
         kept = [seed for seed, curve in curves.items() if len(curve) >= length]
         return cls(
-            name=record["name"],
-            label=record["label"],
-            task=record["task_name"],
-            task_hash=record["task_hash"],
+            name=record.name,
+            label=record.label,
+            task=record.task_name,
+            task_hash=record.task_hash,
             task_file=now,
-            algorithm=identity["algorithm"],
-            model=identity["model"],
+            algorithm=identity.algorithm,
+            model=identity.model,
             parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
             networks=parameters.get("networks"),
             fixed=int(parameters.get("fixed", 0)),
@@ -193,22 +188,22 @@ class EntryResults(Shown):
             executions=sum(spent["executions"] for spent in records.values()),
             records=records,
             folder=folder,
-            identity=identity,
+            identity=identity.content,
             options={
-                "algorithm": _mapping(identity.get("algorithm_options")),
-                "model": _mapping(identity.get("model_options")),
+                "algorithm": identity.algorithm_options,
+                "model": identity.model_options,
                 "environment": now.environment.options,
             },
-            preset=preset if isinstance(preset, str) else None,
-            tuning=record["tuning"],
-            plan=record.get("plan"),
+            preset=record.preset,
+            tuning=record.tuned,
+            plan=record.plan,
             versions=provenance.versions(made_with),
             commits=provenance.texts(made_with, "commit"),
             processors=provenance.texts(made_with, "processor"),
             devices=provenance.devices(made_with),
             unprobed=any(map(probes.third_party, made_with)) and probes.EQUAL not in probed,
-            first_thresholds=task_file.ranking.grid.thresholds,
-            external=bool(record.get("imported")),
+            first_thresholds=record.task_file.ranking.grid.thresholds,
+            external=record.imported is not None,
             plugins=codes.contents(record, facts.get("codes", ())),
             **facts,
         )
@@ -415,13 +410,14 @@ class EntryResults(Shown):
         return self.task_file.protocol.interactions
 
 
-def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
-    """Return a task's file as it is registered now, where its runs were made under the same definition of it.
+def current(record: EntryRecord) -> TaskFile:
+    """Return the file of an entry's task as it is registered now, where the entry has the same definition of it.
 
     Ranking is no part of a definition: without this the cells of a board would be those of whichever entry comes first.
     """
-    registered = registered_task(name)
-    return registered.file if registered is not None and registered.hash == hash_ else stored
+    registered = registered_task(record.task_name)
+    same = registered is not None and registered.hash == record.task_hash
+    return registered.file if registered is not None and same else record.task_file
 
 
 def edited_between(first: EntryResults, second: EntryResults) -> str:

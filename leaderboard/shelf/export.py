@@ -47,7 +47,8 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
             "is published: it cannot be exported"
         )
     codes.require_installed(store, entry.seeds, identity.of(built))
-    record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
+    record = store.record()
+    run = {name: value for name, value in record.content.items() if name not in ("published", "code")}
     folder = out / entry.task / built.name
     kept = _agents(store, entry) if agents else {}
     if kept and not force and _add_agents(folder, entry, store, kept):
@@ -61,7 +62,13 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
             "repeat the `qrlsuite run` that made it"
         )
     content = published.files(
-        {**record, **({"code": runs[0].record["code"]} if entry.codes else {})},
+        {
+            "preset": None,
+            "tuning": None,
+            **run,
+            **({} if record.tuned is None else {"tuning": record.tuned}),
+            **({"code": runs[0].record["code"]} if entry.codes else {}),
+        },
         entry.seeds,
         entry.curves,
         [run.seconds / 3600 for run in runs],
@@ -101,9 +108,9 @@ def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Ma
     stated, files = published.encode_agents(agents)
     origins = [_made_with((store.seed(seed).record() or {}).get("provenance") or [{}]) for seed in agents]
     stated["agents"]["provenance"] = [json.loads(origin) for origin in dict.fromkeys(map(_frozen, origins))]
-    record = {**there.record, "published": {**there.record["published"], **stated}}
+    record = there.record.changed(published={**there.published.content, **stated})
     kept = {name: (folder / name).read_bytes() for name in (published.CURVES, published.SEEDS)}
-    _replace(folder, {"entry.json": published.encode_record(record), **kept, **files})
+    _replace(folder, {"entry.json": published.encode_record(record.content), **kept, **files})
     published.read(folder).parameters()
     return True
 
@@ -142,7 +149,7 @@ def _refuse_smaller(folder: Path, entry: EntryResults, force: bool) -> None:
     except StoreError as error:
         raise QrlSuiteError(f"{error}; --force replaces it") from None
     if len(before.seeds) > len(entry.seeds) or before.curves.shape[1] > entry.curves.shape[1]:
-        if before.record["name"] == entry.folder.name.partition("@")[0] != entry.folder.name:
+        if before.record.name == entry.folder.name.partition("@")[0] != entry.folder.name:
             raise QrlSuiteError(
                 f"{entry.folder} holds seeds of another code than those exported to {folder}: --out another folder"
             )

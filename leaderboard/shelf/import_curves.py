@@ -35,6 +35,7 @@ from qrlsuite.results import provenance
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.genuine import require_no_link
 from qrlsuite.results.points import Points, Run
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import (
     EntryStore,
@@ -42,7 +43,6 @@ from qrlsuite.results.store import (
     round_means,
     table_bytes,
     write_atomically,
-    write_json,
 )
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
@@ -122,7 +122,7 @@ def import_points(
     stores = {}
     for entry, of_seeds in by_entry.items():
         record = _record(entry, name, file, definition, told)
-        stores[entry] = EntryStore(runs / name / str(record["name"])), record
+        stores[entry] = EntryStore(runs / name / record.name), record
         _require_no_copies(
             entry, {seed: curves[entry, seed] for seed in of_seeds}, of_seeds, stores[entry][0]
         )
@@ -166,7 +166,7 @@ def _known_task(name: str, runs: Path) -> tuple[TaskFile, dict[str, Any], str] |
         return loaded.file, loaded.definition, loaded.name
     if runs.is_dir() and "/" not in name and (held := entries(runs, name)):
         record = held[0].record()
-        return TaskFile.model_validate(record["task_file"]), record["identity"]["task"], record["task_name"]
+        return record.task_file, record.identity.task, record.task_name
     return None
 
 
@@ -376,7 +376,7 @@ def _require_no_copies(
 
 def _record(
     entry: str, task: str, file: TaskFile, definition: Mapping[str, Any], told: Mapping[str, Any]
-) -> dict[str, Any]:
+) -> EntryRecord:
     """Return what `entry.json` says of an entry."""
     words = _notation_of(entry)
     identity = {
@@ -386,7 +386,7 @@ def _record(
         "model": words[0],
         "model_options": {**words[1], "name": entry},
     }
-    return {
+    content = {
         "name": f"{EXTERNAL}-{words[0]}-{digest(identity)[:8]}",
         "hash": digest(identity),
         "label": f"{EXTERNAL} {entry}",
@@ -397,26 +397,26 @@ def _record(
         "task_file": file.model_dump(mode="json", exclude={"tuning"}),
         "identity": identity,
     }
+    return EntryRecord.read(content, f"'{printable(entry)}'")
 
 
 def _write(
     entry: str,
     curves: Mapping[int, NDArray[np.float64]],
     store: EntryStore,
-    record: dict[str, Any],
+    record: EntryRecord,
     points: Mapping[Run, Points],
 ) -> Imported:
     """Write the seeds of an entry that are not there yet."""
-    told = record["imported"]
     require_no_link(store.path.parent, store.path)
     if (store.path / "entry.json").exists():
-        before = store.record()["imported"].get("maximum")
-        if before != told["maximum"]:
+        before = store.record().maximum
+        if before != record.maximum:
             raise OptionError(
                 f"maximum: '{entry}' was imported with {before}: seeds of one entry have one scale"
             )
     else:
-        write_json(store.path / "entry.json", record)
+        store.write_record(record)
     claim = acquire(store, list(curves))
     try:
         present, new, known, differing = set(store.seeds()), list[int](), list[int](), list[int]()
@@ -432,14 +432,15 @@ def _write(
         claim.release()
     lasts = [int(points[entry, seed].steps[-1]) for seed in curves]
     notes = differences(differing) + _notes(
-        entry, curves, lasts, sorted({*present, *new}), record["task_file"]["protocol"]["interactions"]
+        entry, curves, lasts, sorted({*present, *new}), record.task_file.protocol.interactions
     )
-    name, label, task = (str(record[key]) for key in ("name", "label", "task_name"))
-    return Imported(store, name, label, task, tuple(new), tuple(known), tuple(notes))
+    return Imported(
+        store, record.name, record.label, record.task_name, tuple(new), tuple(known), tuple(notes)
+    )
 
 
 def _write_seed(
-    store: EntryStore, seed: int, curve: NDArray[np.float64], record: Mapping[str, Any], own: Points
+    store: EntryStore, seed: int, curve: NDArray[np.float64], record: EntryRecord, own: Points
 ) -> None:
     made = unplaced(store, seed)
     made.path.mkdir(parents=True)
@@ -447,15 +448,15 @@ def _write_seed(
     write_atomically(made.table, table_bytes(rows))
     made.write_record(
         {
-            "task": record["task_name"],
-            "task_hash": record["task_hash"],
-            "entry": record["name"],
-            "label": record["label"],
+            "task": record.task_name,
+            "task_hash": record.task_hash,
+            "entry": record.name,
+            "label": record.label,
             "algorithm": EXTERNAL,
-            "model": record["identity"]["model"],
+            "model": record.identity.model,
             "parameters": {},
             "seed": seed,
-            "interactions_per_epoch": record["task_file"]["protocol"]["interactions"],
+            "interactions_per_epoch": record.task_file.protocol.interactions,
             "status": "finished",
             "epochs": len(rows),
             "imported": {
@@ -522,12 +523,12 @@ def _notes(
 def told(done: Sequence[Imported]) -> list[str]:
     """Say on which grid and by which thresholds imported entries stand."""
     record = done[0].store.record()
-    file, imported = TaskFile.model_validate(record["task_file"]), record["imported"]
-    best = imported["maximum"]
+    file, best = record.task_file, record.maximum
+    grid = "" if record.imported is None else record.imported.grid
     scale = f"scores over {best:g}; " if best is not None else ""
     levels = ", ".join(f"{level:g}" for level in sorted(file.ranking.grid.thresholds))
     less = f" on {file.score.called}, less is better" if file.score.goal == "below" else ""
     return [
-        f"grid: {imported['grid']}",
+        f"grid: {grid}",
         f"{scale}thresholds {levels}{less}; horizon {file.ranking.horizons[0]} steps",
     ]

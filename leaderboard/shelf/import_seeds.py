@@ -155,7 +155,7 @@ def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
     if name in registry.load().of(specs.TaskSpec):
         here = {tasks.load(name).hash}
     else:  # a task of the user's own file is known by its entries
-        here = {str(o.record()["task_hash"]) for o in (entries(runs, name) if runs.is_dir() else [])}
+        here = {store.record().task_hash for store in (entries(runs, name) if runs.is_dir() else [])}
     if here and entry.task.hash not in here:
         raise StoreError(
             f"{source.path} was made under another definition of task '{name}' ({entry.task.hash}, here "
@@ -222,7 +222,7 @@ def _from_export(
                 line[f"{MEASURED}.{name}"] = None if math.isnan(value) else value
         if executions := int(exported.executions[row]):
             rows[-1]["executions"] = {"imported": executions}
-        diverged, probe = exported.diverged.get(seed), exported.probe
+        diverged, probe = exported.published.diverged.get(str(seed)), exported.published.probe
         if diverged is not None:
             rows[diverged - 1]["diverged"] = True
         made = unplaced(store, seed)
@@ -241,14 +241,14 @@ def _from_export(
                 "algorithm": entry.algorithm.name,
                 "model": entry.model.name,
                 "family": entry.model.family,
-                "parameters": dict(exported.record["published"]["parameters"]),
+                "parameters": exported.published.parameters,
                 "seed": seed,
                 "interactions_per_epoch": entry.task.file.protocol.interactions,
                 "status": "finished",
                 "epochs": len(rows),
-                **({"code": exported.record["code"]} if "code" in exported.record else {}),
+                **({} if (code := exported.record.code) is None else {"code": code.content}),
                 **({} if diverged is None else {"diverged": diverged}),
-                **({"probe": dict(probe)} if probe.get("seed") == seed else {}),
+                **({} if probe is None or probe.seed != seed else {"probe": probe.content}),
                 **({} if seed in agents else {"agent": False}),
                 "provenance": [dict(exported.provenance[row])],
             }

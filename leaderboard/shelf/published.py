@@ -27,14 +27,14 @@ from safetensors.numpy import save as encode
 
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
-from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.notation import parse_entry
 from qrlsuite.registry import load as registered
-from qrlsuite.results import codes, parquet, probes, provenance
+from qrlsuite.results import codes, parquet, provenance
+from qrlsuite.results.records import AgentsRecord, EntryRecord, PublishedRecord
 from qrlsuite.results.store import (
     MEASURED,
     Arrays,
@@ -69,8 +69,6 @@ class PublishedEntry:
 
     Attributes
     ----------
-    record:
-        `entry.json`.
     curves:
         (N, T) float64.
     hours, executions:
@@ -84,8 +82,7 @@ class PublishedEntry:
     """
 
     folder: Path
-    record: Mapping[str, Any]
-    task_file: TaskFile
+    record: EntryRecord
     seeds: tuple[int, ...]
     curves: NDArray[np.float64]
     measured: Mapping[str, NDArray[np.float64]]
@@ -95,34 +92,33 @@ class PublishedEntry:
     fingerprint: Fingerprint
 
     @property
+    def task_file(self) -> TaskFile:
+        """The task as the record holds it."""
+        return self.record.task_file
+
+    @property
+    def published(self) -> PublishedRecord:
+        """What the record says beside what was run."""
+        assert self.record.published is not None
+        return self.record.published
+
+    @property
     def provenance(self) -> list[Mapping[str, Any]]:
         """What each seed was made with, in the seeds' order."""
-        made = self.record["published"]["provenance"]
-        return [made[index] for index in self.origins]
-
-    @property
-    def diverged(self) -> dict[int, int]:
-        """By seed, the first epoch after which its agent's numbers were not finite; seeds without one are absent."""
-        return {int(seed): epoch for seed, epoch in self.record["published"].get("diverged", {}).items()}
-
-    @property
-    def probe(self) -> Mapping[str, Any]:
-        """What a probe of independent seeds found (`qrlsuite.results.probes`); empty where none was made."""
-        found: Mapping[str, Any] = self.record["published"].get("probe", {})
-        return found
+        return [self.published.provenance[index] for index in self.origins]
 
     @property
     def agents(self) -> tuple[int, ...]:
         """The seeds whose trained agents are published; none where the entry is of curves alone."""
-        return tuple(self.record["published"].get("agents", {}).get("seeds", ()))
+        return () if self.published.agents is None else tuple(self.published.agents.seeds)
 
     def parameters(self) -> dict[int, Arrays]:
         """Return the trained parameters by seed."""
-        path, stated = self.folder / AGENTS, self.record["published"].get("agents", {})
-        if not self.agents:
+        path, stated = self.folder / AGENTS, self.published.agents
+        if stated is None:
             return {}
         stacked = read_arrays(path, MAX_BYTES)
-        if _sha256(path) != stated["sha256"]:
+        if _sha256(path) != stated.sha256:
             raise StoreError(
                 f"{path} is not the file whose hash is in entry.json: restore it, or export the entry again"
             )
@@ -140,18 +136,16 @@ class PublishedEntry:
 
         A study with looks has a block of its own, and takes no seeds beside it.
         """
-        if "plan" in self.record or self.seeds == tuple(range(len(self.seeds))):
+        if self.record.plan is not None or self.seeds == tuple(range(len(self.seeds))):
             return ""
         missing = next(seed for seed, held in enumerate(self.seeds) if seed != held)
         return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
 
     def entry_results(self) -> EntryResults:
         """Return what a leaderboard ranks."""
-        published = self.record["published"]
-        made_by = [codes.read(self.record, self.folder / "entry.json")]
+        made_by, diverged = [self.record.code_identity], self.published.diverged
         return EntryResults.of_record(
             self.record,
-            self.task_file,
             self.folder,
             dict(zip(self.seeds, self.curves)),
             {
@@ -160,13 +154,13 @@ class PublishedEntry:
                     "finished": True,
                     "hours": float(hours),
                     "executions": int(executions),
-                    "diverged": self.diverged.get(seed),
+                    "diverged": diverged.get(str(seed)),
                 }
                 for seed, hours, executions in zip(self.seeds, self.hours, self.executions)
             },
-            published["parameters"],
+            self.published.parameters,
             [made for last in self.provenance for made in provenance.records(last)],
-            {self.probe.get("result", "")},
+            {self.published.probe.result} if self.published.probe else (),
             codes=codes.distinct(made_by),
             environments=codes.environments(made_by),
             source="published",
@@ -198,7 +192,7 @@ class PublishedAgents(EntryStore):
         self.published = read(folder)
         if not self.published.agents:
             record = self.published.record
-            words = command("run", "--task", record["task_name"], record["label"], runs=runs)
+            words = command("run", "--task", record.task_name, record.label, runs=runs)
             with_agents = [
                 f"{p.parent.parent.name}/{p.parent.name}"
                 for at in folders()
@@ -209,8 +203,9 @@ class PublishedAgents(EntryStore):
                 f"{folder} is published as curves without agents{others}; {words} trains it here"
             )
         self.agents = self.published.parameters()
-        stated = self.published.record["published"]["agents"]["sha256"]
-        self.evaluations = runs / folder.parent.name / folder.name / f"evaluations-{stated[:16]}"
+        stated = self.published.published.agents
+        assert stated is not None
+        self.evaluations = runs / folder.parent.name / folder.name / f"evaluations-{stated.sha256[:16]}"
 
     def seeds(self) -> list[int]:
         """Return the seeds whose agents are there."""
@@ -231,7 +226,7 @@ class _PublishedSeed(SeedStore):
     def record(self) -> dict[str, Any]:
         """Return what `run.json` has of a seed's end and code."""
         entry = self._published.published
-        code = {name: entry.record[name] for name in ("code",) if name in entry.record}
+        code = {} if entry.record.code is None else {"code": entry.record.code.content}
         return {**code, "status": "finished", "epochs": int(entry.curves.shape[1])}
 
     def read(self) -> SeedRun:
@@ -297,41 +292,23 @@ def _read(folder: Path, label: bool) -> PublishedEntry:
         if (folder / name).stat().st_size > MAX_BYTES:
             raise StoreError(f"{folder / name}: larger than {MAX_BYTES // 1_000_000} MB")
     record = EntryStore(folder).record()
-    task_file = TaskFile.model_validate(record["task_file"])
-    published = record["published"]
-    codes.read(record, folder / "entry.json")
-    _check_identity(folder, record, task_file)
+    published = record.published
+    if published is None:
+        raise StoreError(f"{folder / 'entry.json'} has no table 'published': it is no published entry's")
+    _check_identity(folder, record)
     if label:
-        _check_label(folder, record, task_file)
-    made_with = published["provenance"]
+        _check_label(folder, record)
+    rows = published.seeds * published.epochs
+    seeds, curves, measured = _curves(folder, record.task_file, rows, published.measured)
     _require(
-        isinstance(made_with, list) and made_with != [] and all(isinstance(made, dict) for made in made_with),
+        published.diverged.keys() <= set(map(str, seeds))
+        and all(epoch <= published.epochs for epoch in published.diverged.values()),
         folder,
-        "provenance is not a list of records",
+        f"diverged: {str(published.diverged)[:100]} does not name seeds and their epochs",
     )
-    counts = {"fixed": 0, **published["parameters"]}
-    for family in ("classical", "quantum", "fixed"):
-        count = counts[family]
-        _require(type(count) is int and 0 <= count < 10**12, folder, f"{family} parameters: {count!r}")
-    networks = published["parameters"].get("networks", 1)
-    _require(type(networks) is int and 0 <= networks < 10**6, folder, f"networks: {networks!r}")
-    for name in ("seeds", "epochs"):
-        count = published[name]
-        _require(type(count) is int and 0 < count < 10**9, folder, f"{name}: {count!r}")
-    names = published.get("measured", [])
-    _require(
-        isinstance(names, list)
-        and len(names) <= _MOST_METRICS
-        and all(isinstance(name, str) and NAME.fullmatch(name) for name in names)
-        and names == sorted(set(names)),
-        folder,
-        f"measured: {ascii(names)[:100]} does not name metrics",
-    )
-    seeds, curves, measured = _curves(folder, task_file, published["seeds"] * published["epochs"], names)
-    _check_found(folder, published, seeds)
-    facts = _table(folder / SEEDS, _SEED_COLUMNS, published["seeds"], 10_000)
+    facts = _table(folder / SEEDS, _SEED_COLUMNS, published.seeds, 10_000)
     _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
-    _check_agents(folder, published, seeds)
+    _check_agents(folder, published.agents, seeds)
     hours = np.array(facts["hours"], np.float64)
     executions = np.array(facts["executions"], np.int64)
     origins = np.array(facts["origin"], np.int64)
@@ -345,7 +322,7 @@ def _read(folder: Path, label: bool) -> PublishedEntry:
     )
     _require(bool((executions >= 0).all()), folder, "circuit executions must not be negative")
     _require(
-        bool((origins >= 0).all() and (origins < len(made_with)).all()),
+        bool((origins >= 0).all() and (origins < len(published.provenance)).all()),
         folder,
         "a seed names a provenance that is not there",
     )
@@ -356,47 +333,18 @@ def _read(folder: Path, label: bool) -> PublishedEntry:
         folder,
         f"{SEEDS} has rows of different lengths",
     )
-    return PublishedEntry(
-        folder, record, task_file, seeds, curves, measured, hours, executions, origins, beginning
-    )
+    return PublishedEntry(folder, record, seeds, curves, measured, hours, executions, origins, beginning)
 
 
-def _check_found(folder: Path, published: Mapping[str, Any], seeds: Sequence[int]) -> None:
-    """Check what was found in training: seeds that diverged, and what a probe of independent seeds says."""
-    diverged, probe, names = published.get("diverged", {}), published.get("probe", {}), set(map(str, seeds))
-    _require(
-        isinstance(diverged, dict)
-        and diverged.keys() <= names
-        and all(type(epoch) is int and 0 < epoch <= published["epochs"] for epoch in diverged.values()),
-        folder,
-        f"diverged: {str(diverged)[:100]} does not name seeds and their epochs",
-    )
-    _require(
-        isinstance(probe, dict) and (not probe or probe.get("result") in (probes.EQUAL, probes.NOT_PROBED)),
-        folder,
-        f"probe: {str(probe)[:100]} is not the result of one that found seeds independent",
-    )
-
-
-def _check_agents(folder: Path, published: Mapping[str, Any], seeds: Sequence[int]) -> None:
+def _check_agents(folder: Path, stated: AgentsRecord | None, seeds: Sequence[int]) -> None:
     """Check that the file of agents is there if, and only if, the record names seeds and a hash."""
-    stated = published.get("agents")
     if stated is None:
         _require(
             not (folder / AGENTS).exists(), folder, f"{AGENTS} is there, and entry.json does not name it"
         )
         return
-    own = stated.get("seeds") if isinstance(stated, dict) else None
     _require(
-        isinstance(own, list)
-        and own != []
-        and all(type(seed) is int for seed in own)
-        and own == sorted(set(own) & set(seeds))
-        and isinstance(stated.get("sha256"), str)
-        and isinstance(stated.get("provenance", []), list)
-        and all(isinstance(made, dict) for made in stated.get("provenance", [])),
-        folder,
-        f"agents: {str(stated)[:100]} does not name seeds of the entry, in their order, and a hash",
+        set(stated.seeds) <= set(seeds), folder, f"agents: not all of {str(stated.seeds)[:100]} are its seeds"
     )
     _require(
         (folder / AGENTS).is_file(),
@@ -414,18 +362,16 @@ def _require(holds: bool, folder: Path, problem: str) -> None:
         raise StoreError(f"{folder}: {problem}")
 
 
-def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -> None:
+def _check_identity(folder: Path, record: EntryRecord) -> None:
     """Check that place and protocol are those of what the hashes stand for."""
-    identity, task, expected = record["identity"], record["identity"]["task"], record["name"]
-    for part in ("algorithm_options", "model_options"):
-        _require(isinstance(identity[part], dict), folder, f"{part} is not a table")
-    for name in (identity["algorithm"], identity["model"]):
+    for name in (record.identity.algorithm, record.identity.model):
         _require(bool(NAME.fullmatch(name)), folder, f"{name!r} is not a name")
     _require(
-        (folder.parent.name, folder.name) == (record["task_name"], expected),
+        (folder.parent.name, folder.name) == (record.task_name, record.name),
         folder,
-        f"its place is {record['task_name']}/{expected}",
+        f"its place is {record.task_name}/{record.name}",
     )
+    task_file, task = record.task_file, record.identity.task
     protocol = task_file.protocol
     stated = {
         "environment": task_file.environment.name,
@@ -442,22 +388,22 @@ def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile
         )
 
 
-def _check_label(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -> None:
+def _check_label(folder: Path, record: EntryRecord) -> None:
     """Check the label, and that the options still make the hash, as far as the parts are installed."""
-    identity, known = record["identity"], registered()
+    identity, registry = record.identity, registered()
     if not (
-        identity["algorithm"] in known.of(AlgorithmSpec)
-        and identity["model"] in known.of(ModelSpec)
-        and task_file.environment.name in known.of(EnvironmentSpec)
+        identity.algorithm in registry.of(AlgorithmSpec)
+        and identity.model in registry.of(ModelSpec)
+        and record.task_file.environment.name in registry.of(EnvironmentSpec)
     ):
-        usual = f"{identity['algorithm']} {identity['model']}"
-        _require(record["label"].startswith(usual), folder, f"its label does not begin with {usual!r}")
+        usual = f"{identity.algorithm} {identity.model}"
+        _require(record.label.startswith(usual), folder, f"its label does not begin with {usual!r}")
         return
-    entry = from_record(record, str(folder / "entry.json"))  # builds the options anew, and compares the hash
+    entry = record.entry(str(folder / "entry.json"))  # builds the options anew, and compares the hash
     _require(
-        record["label"] == entry.label or _words(record["label"]) == _words(entry.label),
+        record.label == entry.label or _words(record.label) == _words(entry.label),
         folder,
-        f"its label is {record['label']!r}, and should be {entry.label!r}",
+        f"its label is {record.label!r}, and should be {entry.label!r}",
     )
 
 
@@ -482,9 +428,6 @@ _SEED_COLUMNS = {
     "episodes": "list<double>",
     "parameters": "list<double>",
 }
-
-
-_MOST_METRICS = 100
 
 
 def _curves(

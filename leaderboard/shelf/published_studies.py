@@ -48,7 +48,7 @@ class PublishedStudy(StudyWithLooks):
             path = folder / entry.task.name / entry.name
             if path.is_dir():
                 self._published[name] = read = published.read(path, labels)
-                if read.record["hash"] != entry.hash:
+                if read.record.hash != entry.hash:
                     raise StoreError(f"{path} is not the study's entry '{entry.label}' ({entry.hash})")
                 if (length := read.curves.shape[1]) < self.epochs:
                     raise StoreError(f"{path} has {length} epochs, and its study {self.epochs}")
@@ -66,7 +66,7 @@ class PublishedStudy(StudyWithLooks):
         """Yield the seeds of an entry."""
         if (each := self._published.get(name)) is not None:
             for seed, curve, hours in zip(each.seeds, each.curves, each.hours):
-                yield Run(seed, each.record, curve[: self.epochs], float(hours))
+                yield Run(seed, each.record.plan, curve[: self.epochs], float(hours))
 
     def executions(self, name: str) -> float:
         """Return the circuit executions of an entry's seeds, mean per seed; 0 where it has none."""

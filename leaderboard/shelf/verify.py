@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import QrlSuiteError, listed
 from qrlsuite.experiment import identity
-from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard.shelf import plausible, published
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.leaderboard.shelf.curves import current
 from qrlsuite.leaderboard.shelf.fingerprint import CHUNK, fingerprint
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
-from qrlsuite.results import codes, provenance, speed
+from qrlsuite.results import provenance, speed
 from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import learning_curve
 from qrlsuite.results.text import hours_text
@@ -155,7 +155,7 @@ def verify(
     try:
         entry, digest = published.read(folder), _digest(folder)
         _check_agents(entry)
-        made_by = from_record(entry.record, str(folder / "entry.json")) if rerun else None
+        made_by = entry.record.entry(str(folder / "entry.json")) if rerun else None
     except QrlSuiteError as error:
         return VerificationResult(folder, name, False, "files", (), str(error))
     count, length = entry.curves.shape
@@ -185,7 +185,7 @@ def _check_agents(entry: PublishedEntry) -> None:
     from qrlsuite.training.evaluation import require_fitting  # torch, which checking files does without
     from qrlsuite.training.trainer import Trainer
 
-    trainer = Trainer(from_record(entry.record, str(entry.folder / "entry.json")), [0])
+    trainer = Trainer(entry.record.entry(str(entry.folder / "entry.json")), [0])
     require_fitting(trainer, agents[entry.agents[0]], entry.folder / published.AGENTS)
 
 
@@ -262,7 +262,7 @@ def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
 
     Other `numerics` are the same code with other bits, see `_elsewhere`.
     """
-    made_with = codes.read(entry.record, entry.folder / "entry.json")
+    made_with = entry.record.code_identity
     if made_with is None:
         return None
     changed = identity.differences(made_with.parts, identity.of(made_by).parts, numerics=False)
@@ -300,7 +300,7 @@ def retrain(
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Retrained:
     """Train seeds of an entry from nothing, in memory: those at some places, or all."""
-    made_by = from_record(entry.record, str(entry.folder / "entry.json"))
+    made_by = entry.record.entry(str(entry.folder / "entry.json"))
     seeds = entry.seeds if places is None else [entry.seeds[place] for place in places]
     epochs = entry.curves.shape[1]
     parts = [_group(made_by, seeds[i : i + CHUNK], epochs, report) for i in range(0, len(seeds), CHUNK)]
@@ -350,7 +350,7 @@ def _counts(
 
     Circuit executions of seeds whose curves are equal are equal. Those of others depend on the lengths of episodes.
     """
-    stated = entry.record["published"]["parameters"]
+    stated = entry.published.parameters
     allowed = again.parameters if "networks" not in stated else again.parameters[:1]
     if not any(_same_parameters(stated, counted) for counted in allowed):
         return f"its record has parameters {dict(stated)}, counted here: {dict(again.parameters[0])}"
@@ -461,8 +461,7 @@ def _plausible(entry: PublishedEntry, again: NDArray[np.float64], places: list[i
             False,
             f"seed {numbers}: the first {first} epochs are not its own, other seeds' curves are nearer",
         )
-    record, steps = entry.record, entry.task_file.protocol.interactions
-    grid = current(entry.task_file, record["task_name"], record["task_hash"]).ranking.grid
+    steps, grid = entry.task_file.protocol.interactions, current(entry.record).ranking.grid
 
     def times(curves: NDArray[np.float64]) -> NDArray[np.float64]:
         return plausible.per_run(curves, grid, steps)

@@ -492,7 +492,7 @@ def diagnose(
             "name an entry, or `ansatz` and the name of one, as in `qrlsuite diagnose ansatz iqp`"
         )
     on, stores = find_players(Selection.create(runs, task, published), entries)
-    tasks = sorted({str(store.record()["task_name"]) for store in stores}) if on is None else [on.name]
+    tasks = sorted({store.record().task_name for store in stores}) if on is None else [on.name]
     if len(tasks) > 1:
         raise OptionError(
             f"the entries belong to different tasks ({', '.join(tasks)}): diagnose them one by one"

@@ -306,7 +306,7 @@ def _has_agents(copy: EntryResults) -> bool:
 
 
 def _one_task(stores: Sequence[EntryStore]) -> None:
-    tasks = {store.record()["task_hash"]: store.record()["task_name"] for store in stores}
+    tasks = {record.task_hash: record.task_name for record in (store.record() for store in stores)}
     if len(tasks) > 1:
         raise OptionError(
             f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes and sums "

@@ -191,11 +191,10 @@ def _outline(store: EntryStore) -> dict[str, Any]:
     if not published_entries.is_published(store.path):
         return content
     made = published_entries.read(store.path)
-    said = made.record["published"]
     return content | {
         "seeds": len(made.seeds),
-        "provenance": said["provenance"],
-        "parameters": said["parameters"],
+        "provenance": made.published.provenance,
+        "parameters": made.published.parameters,
     }
 
 
@@ -217,7 +216,7 @@ def _codes_of_seeds(store: EntryStore) -> dict[str, list[str]]:
     """Return the digests of the code of an entry's seeds, or of its record where it is published."""
     if published_entries.is_published(store.path):
         made = published_entries.read(store.path)
-        code = codes.read(made.record, store.path / "entry.json")
+        code = made.record.code_identity
         return {format_seeds(made.seeds): ["not recorded" if code is None else code.digest]}
     return {
         format_seeds(group.seeds): [digest or "not recorded" for digest in group.codes]

@@ -34,12 +34,13 @@ import numpy as np
 from qrlsuite import own
 from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
 from qrlsuite.experiment import identity
-from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore, read_arrays
 from qrlsuite.training.remote_task import pack, unpack
 
@@ -153,7 +154,7 @@ def in_fresh_process(
 ) -> tuple[Side, float]:
     """Do what `train` does in a process that has run nothing else; returns its processor time, too."""
     task: dict[str, Any] = {
-        "entry": entry.record(),
+        "entry": EntryRecord.of(entry).content,
         "seeds": list(seeds),
         "epochs": epochs,
         "device": device,
@@ -303,7 +304,7 @@ def main(arguments: Sequence[str]) -> int:
         for path in task["plugins"]:
             own.load(path)
         start = None if task["start"] is None else Path(task["start"])
-        entry = from_record(task["entry"], "the probe")
+        entry = EntryRecord.read(task["entry"], "the probe").entry("the probe")
         side = train(entry, task["seeds"], task["epochs"], task["device"], start)
         header |= {"lines": side.lines, "changed": side.changed}
         arrays = side.arrays

@@ -35,12 +35,13 @@ from qrlsuite.engine.work import (
 from qrlsuite.engine.worker import checkpoint_seconds
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
-from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire_each
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.provenance import PACKAGES
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, json_line
 from qrlsuite.training.remote_task import MOST_BYTES, POLICY, pack, too_large, unpack, versions
@@ -77,7 +78,7 @@ def _expected(entry_hash: str, record: bytes) -> Expected:
 
     threads = torch.get_num_threads()
     try:
-        trainer = Trainer(from_record(json.loads(record), "the entry"), [0])
+        trainer = Trainer(EntryRecord.read(json.loads(record), "the entry").entry("the entry"), [0])
     finally:
         torch.set_num_threads(threads)  # this may be a user's notebook
     trainer.start()
@@ -86,7 +87,7 @@ def _expected(entry_hash: str, record: bytes) -> Expected:
 
 def seeds_per_task(entry: Entry) -> int:
     """Return how many seeds of an entry fit into a task, at most."""
-    size = _expected(entry.hash, json_line(entry.record())).seed_bytes
+    size = _expected(entry.hash, json_line(EntryRecord.of(entry).content)).seed_bytes
     if size > MOST_BYTES - HEADER_BYTES:
         raise OptionError(f"'{entry.label}': {too_large(size, 1)}")
     return (MOST_BYTES - HEADER_BYTES) // size
@@ -139,7 +140,7 @@ class _Run:
         found = versions([*PACKAGES, *self.entry.distributions()])
         self.versions = {name: version for name, version in found.items() if version is not None}
         self.seconds = checkpoint_seconds(TASK_SECONDS)
-        self.expected = _expected(self.entry.hash, json_line(self.entry.record()))
+        self.expected = _expected(self.entry.hash, json_line(EntryRecord.of(self.entry).content))
         self.found: dict[str, Any] | None = None
         """What a probe has found, see `qrlsuite.engine.probe`."""
         self.outcome = EngineOutcome()
@@ -229,7 +230,7 @@ class _Run:
         token, first = secrets.token_hex(16), member.first
         header = {
             "token": token,
-            "entry": self.entry.record(),
+            "entry": EntryRecord.of(self.entry).content,
             "seeds": list(member.group.seeds),
             "epoch": member.epoch,
             "epochs": self._last_epoch(member),

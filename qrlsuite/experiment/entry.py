@@ -14,19 +14,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pydantic
-
 from qrlsuite import notation, options, registry, specs
-from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset as presets
-from qrlsuite.experiment.task import Task, TaskFile, digest, load
+from qrlsuite.experiment.task import Task, digest, load
 from qrlsuite.notation import Written
 from qrlsuite.options import Setting
 
 EXTERNAL = "external"
 """What the algorithm of entries is called whose curves another program made; so is their task's environment."""
 
-_START = re.compile(r"[a-z0-9][a-z0-9+._-]*/[a-z0-9][a-z0-9+._@-]*:[1-9]\d{0,8}", re.ASCII)
+START_FORM = re.compile(r"[a-z0-9][a-z0-9+._-]*/[a-z0-9][a-z0-9+._@-]*:[1-9][0-9]{0,8}")
+"""Where training begins, see `Entry.start`."""
 
 
 @dataclass(frozen=True)
@@ -161,26 +160,6 @@ class Entry:
         """Return those of the distributions that are not this suite."""
         return [name for name in self.distributions() if name != "qrlsuite"]
 
-    def record(self) -> dict[str, Any]:
-        """Return what `entry.json` stores: enough to build the entry again anywhere."""
-        tuned = {} if self.tuning is None else {"tuning": self.tuning}
-        planned = {} if self.plan is None else {"plan": self.plan}
-        file = self.task.file.model_dump(mode="json", exclude={"tuning"})
-        if self.task.name in registry.load().of(specs.TaskSpec):
-            file["ranking"].pop("policies", None)  # boards read the registered file; 0.1.1 knows no such key
-        return {
-            "name": self.name,
-            "hash": self.hash,
-            "label": self.label,
-            "preset": self.preset,
-            **tuned,
-            **planned,
-            "task_name": self.task.name,
-            "task_hash": self.task.hash,
-            "task_file": file,
-            "identity": self.identity,
-        }
-
 
 def resolve(
     task: str | Task,
@@ -207,7 +186,7 @@ def resolve(
         raise OptionError(
             f"'{EXTERNAL} {written.model}' has curves that another program made: they can be compared, not trained"
         )
-    if written.start is not None and not _START.fullmatch(written.start):
+    if written.start is not None and not START_FORM.fullmatch(written.start):
         raise OptionError(
             f"{notation.START}={written.start}: write TASK/ENTRY:EPOCHS, or run it with --from ENTRY"
         )
@@ -374,37 +353,3 @@ def _hand_to_ansatz(
         table, Mapping
     ):  # what is no table is refused where the model's options are built
         values["model"]["ansatz_options"] = {**table, **ansatz_options}
-
-
-def from_record(record: Mapping[str, Any], source: str) -> Entry:
-    """Build an entry from what `Entry.record` returned."""
-    try:
-        identity = record["identity"]
-        file = TaskFile.model_validate(record["task_file"])
-        names = [str(record["task_name"]), str(identity["algorithm"]), str(identity["model"])]
-        values = dict(identity["algorithm_options"]), dict(identity["model_options"])
-        preset, expected, start = record["preset"], record["hash"], identity.get(notation.START)
-        if start is not None and not _START.fullmatch(start):
-            raise ValueError(f"{notation.START} is {str(start)[:80]!r}")
-    except (KeyError, TypeError, ValueError, pydantic.ValidationError) as error:
-        raise StoreError(f"{source} is not an entry's record: {type(error).__name__}: {error}") from None
-    task = Task(file, source)
-    task.name = names[0]
-    algorithm, model = registry.get(specs.AlgorithmSpec, names[1]), registry.get(specs.ModelSpec, names[2])
-    entry = Entry(
-        task=task,
-        algorithm=algorithm,
-        model=model,
-        algorithm_options=options.build(specs.resolve(algorithm.options), values[0], source),
-        model_options=options.build(specs.resolve(model.options), values[1], source),
-        preset=preset,
-        tuning=record.get("tuning"),
-        plan=record.get("plan"),
-        start=start,
-    )
-    if entry.hash != expected:
-        raise StoreError(
-            f"{source} was made by a version of the suite or a plugin in which its options meant something else "
-            f"(hash {expected}, now {entry.hash}): keep it for reading, and choose another folder with --runs"
-        )
-    return entry

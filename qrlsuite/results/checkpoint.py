@@ -21,8 +21,9 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as encode
 
 from qrlsuite.errors import StoreError
-from qrlsuite.results.store import FORMAT_VERSION, EntryStore, write_atomically
+from qrlsuite.results.records import FORMAT_VERSION
 from qrlsuite.results.store import Arrays as Arrays
+from qrlsuite.results.store import EntryStore, write_atomically
 
 FILE = "checkpoint.safetensors"  # in the group's folder
 

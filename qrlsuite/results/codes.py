@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import datetime
 import os
-import re
 import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,21 +21,12 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import genuine, survey
 from qrlsuite.results.claims import move_away
+from qrlsuite.results.records import PLUGINS, CodedRecord, EntryRecord
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import EntryStore, copies_of_plugins, read_json, write_json
+from qrlsuite.results.store import EntryStore, copies_of_plugins
 
 UNKNOWN = ""
 """The digest of seeds whose code was not recorded."""
-
-_PART = {
-    "role": str,
-    "name": str,
-    "distribution": str,
-    "numerics": int,
-    "circuit": str,
-    "sha256": str,
-    "files": dict,
-}
 
 
 class ChangedCodeError(StoreError):
@@ -64,24 +54,7 @@ class SameCode:
 
 def read(record: Mapping[str, Any], source: Path) -> CodeIdentity | None:
     """Return the identity that a record has under `code`, None where it has none."""
-    content = record.get("code")
-    if content is None:
-        return None
-    parts = content.get("parts") if isinstance(content, Mapping) else None
-    if isinstance(parts, list) and all(_is_part(part) for part in parts):
-        code = CodeIdentity(tuple(parts))
-        if code.digest == content.get("digest"):
-            return code
-    raise StoreError(f"{source}: code is not a code identity; restore the file")
-
-
-def _is_part(part: Any) -> bool:
-    return (
-        isinstance(part, dict)
-        and {"role", "name"} <= part.keys() <= _PART.keys()
-        and all(isinstance(value, _PART[name]) for name, value in part.items())
-        and all(isinstance(content, str) for content in part.get("files", {}).values())
-    )
+    return CodedRecord.read(record, source).code_identity
 
 
 def distinct(codes: Iterable[CodeIdentity | None]) -> tuple[str, ...]:
@@ -129,21 +102,8 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
             tuple(sorted(seed for digest in alike for seed in seeds[digest])),
             {digest: codes[digest] for digest in alike},
         )
-        for alike in _alike(codes, _declared(store) if len(codes) > 1 else [])
+        for alike in _alike(codes, store.record().same_codes if len(codes) > 1 else [])
     ]
-
-
-def _declared(store: EntryStore) -> list[list[str]]:
-    """Return the digests that were declared to be equal in effect, one list for each declaration."""
-    said = store.record().get("same", [])
-    if not isinstance(said, list) or not all(
-        isinstance(one, dict)
-        and isinstance(one.get("codes"), list)
-        and all(isinstance(code, str) for code in one["codes"])
-        for one in said
-    ):
-        raise StoreError(f"{store.path / 'entry.json'}: same is not a list of declarations; restore the file")
-    return [one["codes"] for one in said]
 
 
 def _alike(codes: Mapping[str, CodeIdentity | None], declared: Sequence[Sequence[str]]) -> list[list[str]]:
@@ -167,7 +127,7 @@ def others(store: EntryStore, current: CodeIdentity) -> list[SameCode]:
     codes = {digest: code for group in held for digest, code in group.codes.items()}
     same = next(
         group
-        for group in _alike({current.digest: current, **codes}, _declared(store))
+        for group in _alike({current.digest: current, **codes}, store.record().same_codes)
         if current.digest in group
     )
     return [group for group in held if not set(group.codes) & set(same)]
@@ -192,7 +152,7 @@ def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
         )
     else:
         change = listed(identity.differences(before.parts, current.parts))
-    if record.get("plan") is None:
+    if record.plan is None:
         anew = (
             f"--fresh trains anew, and the old seeds move to {store.path.name}@{group.mark}; a changed thing can be "
             "registered under another name"
@@ -200,7 +160,7 @@ def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
     else:
         anew = "Restore that code, or write another study"
     return (
-        f"{store.path} has seeds {seeds} of '{record['label']}' that another code has begun: {change}. Nothing was "
+        f"{store.path} has seeds {seeds} of '{record.label}' that another code has begun: {change}. Nothing was "
         f'trained. {anew}; and --same "REASON" says that nothing changed in effect'
     )
 
@@ -231,11 +191,11 @@ def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> 
     groups = of_seeds(store)
     present = {digest: code for group in groups for digest, code in group.codes.items()}
     if exported:
-        code = read(source.record(), source.path / "entry.json")
+        code = source.record().code_identity
         added: Mapping[str, CodeIdentity | None] = {UNKNOWN if code is None else code.digest: code}
     else:
         added = {digest: code for group in of_seeds(source) for digest, code in group.codes.items()}
-    declared = _declared(source) + (_declared(store) if groups else [])
+    declared = source.record().same_codes + (store.record().same_codes if groups else [])
     alike = _alike({**present, **added}, declared)
     if len(alike) < 2:
         return
@@ -251,11 +211,11 @@ def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> 
 
 def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
     """Refuse to train an entry on this machine with other code than the machine that started it has."""
-    path = store.path / "entry.json"
-    sent = read(store.record(), path) if path.exists() else None
-    if sent is None:
+    record = store.record() if (store.path / "entry.json").exists() else None
+    sent = None if record is None else record.code_identity
+    if record is None or sent is None:
         return
-    if len(_alike({sent.digest: sent, current.digest: current}, _declared(store))) > 1:
+    if len(_alike({sent.digest: sent, current.digest: current}, record.same_codes)) > 1:
         differing = listed(identity.differences(sent.parts, current.parts))
         raise ChangedCodeError(
             f"{host} would train {store.path} with another code than the machine that started it: {differing}; "
@@ -272,45 +232,26 @@ def prepare(store: EntryStore, current: CodeIdentity, plugins: Sequence[own.Sour
         The plugins by path among that code. They are copied into the entry's folder, where workers find them.
     """
     record = store.record()
-    kept = {code: list(places) for code, places in _kept(store, record).items() if code != current.digest}
+    kept = {code: places for code, places in record.plugins.items() if code != current.digest}
     places = [_copied(store, plugin) for plugin in plugins]
     if places:
         kept[current.digest] = places
-    if record.get("code") != current.record():
-        _note(store, "code", current.record())
-    if kept != record.get("plugins", {}):
-        _note(store, "plugins", kept)
+    changes: dict[str, Any] = {}
+    if record.code_identity != current:
+        changes["code"] = current.record()
+    if kept != record.plugins:
+        changes["plugins"] = kept
+    if changes:
+        store.write_record(record.changed(**changes))
 
 
-PLUGINS = "plugins"
-"""The folder, in an entry's, of copies of plugins by path: each in a folder named by its content."""
-
-_COPY = re.compile(rf"{PLUGINS}/([0-9a-f]{{16}})/[A-Za-z_][A-Za-z0-9_]*(\.py)?")
-
-
-def _kept(store: EntryStore, record: Mapping[str, Any]) -> Mapping[str, list[str]]:
+def contents(record: EntryRecord, digests: Iterable[str]) -> dict[str, frozenset[str]]:
     """Return where an entry's copies of plugins are, by the digest of the code that they belong to."""
-    kept = record.get("plugins", {})
-    if not isinstance(kept, dict) or not all(
-        isinstance(places, list) and all(isinstance(each, str) and _COPY.fullmatch(each) for each in places)
-        for places in kept.values()
-    ):
-        raise StoreError(f"{store.path / 'entry.json'}: plugins names no copies of plugins; restore the file")
-    return kept
-
-
-def contents(record: Mapping[str, Any], digests: Iterable[str]) -> dict[str, frozenset[str]]:
-    """Return the contents of plugins by path that belong to some codes of an entry, by the plugin's file name.
-
-    Malformed names of copies in a damaged record are left out; none of them is opened.
-    """
-    kept, found = record.get("plugins"), dict[str, set[str]]()
-    places = [kept.get(digest, []) for digest in digests] if isinstance(kept, dict) else []
-    for place in (each for of_code in places if isinstance(of_code, list) for each in of_code):
-        if isinstance(place, str) and _COPY.fullmatch(place):
-            _, mark, name = place.split("/")
-            found.setdefault(name, set()).add(mark)
-    return {name: frozenset(marks) for name, marks in found.items()}
+    marks: dict[str, set[str]] = {}
+    for place in (place for digest in digests for place in record.plugins.get(digest, [])):
+        _, mark, name = place.split("/")
+        marks.setdefault(name, set()).add(mark)
+    return {name: frozenset(of_name) for name, of_name in marks.items()}
 
 
 def _copied(store: EntryStore, plugin: own.Source) -> str:
@@ -337,8 +278,7 @@ def _copied(store: EntryStore, plugin: own.Source) -> str:
 def copies(store: EntryStore) -> list[Path]:
     """Return the copies of plugins by path with which an entry is trained now; imports nothing."""
     record = store.record()
-    code = read(record, store.path / "entry.json")
-    places = [] if code is None else _kept(store, record).get(code.digest, [])
+    places = [] if record.code is None else record.plugins.get(record.code.digest, [])
     for place in places:
         path = store.path / place
         genuine.require_no_link(store.path, store.path / PLUGINS, path.parent, path)
@@ -387,12 +327,8 @@ def declare_same(store: EntryStore, current: CodeIdentity, reason: str) -> None:
         "reason": reason.strip(),
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    _note(store, "same", [*store.record().get("same", []), said])
-
-
-def _note(store: EntryStore, name: str, value: Any) -> None:
-    path = store.path / "entry.json"
-    write_json(path, {**read_json(path), name: value})
+    record = store.record()
+    store.write_record(record.changed(same=[*record.same, said]))
 
 
 def set_aside(
@@ -417,7 +353,7 @@ def set_aside(
         return None, None
     survey.require_movable(runs, store, queued)
     target = store.path.with_name(f"{store.path.name}@{changed[0].mark}")
-    if store.record().get("plan") is not None:
+    if store.record().plan is not None:
         raise StoreError(
             f"{store.path} is of a study with looks that has begun: its seeds stay; write another study"
         )

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qrlsuite.errors import StoreError
-from qrlsuite.experiment.task import digest
 
 if TYPE_CHECKING:
     from qrlsuite.results.store import EntryStore, SeedRun
@@ -46,23 +45,6 @@ def require_plain(path: Path | str, content: object) -> None:
             left += value.values()
         elif isinstance(value, list):
             left += value
-
-
-def require_entry(record: Mapping[str, Any]) -> None:
-    """Refuse an entry's record whose hashes or name do not follow from its own content."""
-    identity = record["identity"]
-    if not isinstance(identity.get("task"), dict):
-        raise ValueError("the task is not a table")
-    for name in ("name", "label", "task_name"):
-        if not record[name].isprintable():
-            raise ValueError(f"{name} {record[name]!r} is not one line of text")
-    if digest(identity["task"]) != record["task_hash"]:
-        raise ValueError("the task's definition does not have its hash")
-    if digest(identity) != record["hash"]:
-        raise ValueError("the options do not have the entry's hash")
-    expected = f"{identity['algorithm']}-{identity['model']}-{record['hash'][:8]}"
-    if record["name"] != expected:
-        raise ValueError(f"it is named {record['name']!r}, and should be {expected!r}")
 
 
 def require_seed(folder: Path, seed: int, record: Mapping[str, Any], names: Mapping[str, Any]) -> None:

@@ -61,9 +61,9 @@ def stored(stores: Iterable[EntryStore]) -> list[Stored]:
         except StoreError:  # is said where it is the one that was asked for
             entries.append(Stored(store, name, name, task, (task, "", str(store.path))))
         else:
-            name, label = record["name"] + store.mark, " ".join([record["label"], store.mark]).rstrip()
-            key = (record["task_name"], record["task_hash"], name)
-            entries.append(Stored(store, name, label, record["task_name"], key))
+            name, label = record.name + store.mark, " ".join([record.label, store.mark]).rstrip()
+            key = (record.task_name, record.task_hash, name)
+            entries.append(Stored(store, name, label, record.task_name, key))
     return entries
 
 

@@ -61,9 +61,12 @@ def require_independent(store: EntryStore) -> None:
 
 def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
     """Return the error for seeds that depend on each other: how they do, likely causes, and the command to type."""
-    identity = store.record()["identity"]
-    kind = specs.AlgorithmSpec if identity["model"] == specs.NO_MODEL else specs.ModelSpec
-    name = str(identity[kind.kind])
+    identity = store.record().identity
+    kind, name = (
+        (specs.AlgorithmSpec, identity.algorithm)
+        if identity.model == specs.NO_MODEL
+        else (specs.ModelSpec, identity.model)
+    )
     known = registry.load().of(kind)
     loaded = own.of_distribution(known[name].distribution) if name in known else None
     plugin = (

@@ -31,6 +31,7 @@ import qrlsuite
 from qrlsuite import files, options, registry, specs
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore, entries, read_lines, write_atomically
 
@@ -275,8 +276,6 @@ def measure(store: EntryStore) -> Speed | None:
     A seed's first epoch does not count: it includes the start of the process. Small groups do not count beside larger
     ones: a seed alone takes many times its share of a group.
     """
-    record = store.record()
-    identity = record["identity"]
     by_group: dict[int, list[float]] = {}
     for seed in store.seeds()[-SAMPLED_SEEDS:]:
         for line in read_lines(store.seed(seed).timings)[1:]:
@@ -294,35 +293,34 @@ def measure(store: EntryStore) -> Speed | None:
         return None
     median = float(statistics.median(seconds))
     low, high = (float(value) for value in np.percentile(seconds, [10, 90]))
-    task = record["task_file"]
+    record = store.record()
+    identity, task = record.identity, record.task_file
     return Speed(
-        (str(task["environment"]["name"]), str(identity["algorithm"]), str(identity["model"])),
-        _options(task, identity),
+        (task.environment.name, identity.algorithm, identity.model),
+        _options(task, identity.algorithm_options, identity.model_options),
         median,
-        str(record["hash"]),
+        record.hash,
         group=largest,
         within=max(median / low if low > 0 else 1.0, high / median),
     )
 
 
 def _subject(entry: Entry) -> Speed:
-    record = entry.record()
     kind = (entry.task.environment.name, entry.algorithm.name, entry.model.name)
-    return Speed(kind, _options(record["task_file"], entry.identity), math.nan, entry.hash)
+    sides = options.identity(entry.algorithm_options), options.identity(entry.model_options)
+    return Speed(kind, _options(entry.task.file, *sides), math.nan, entry.hash)
 
 
-def _options(task: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
+def _options(task: TaskFile, *sides: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that an entry's speed may depend on, by name; a list counts by its length."""
-    protocol = task["protocol"]
+    protocol = task.protocol
     values: dict[str, Any] = {
-        name: protocol.get(name) for name in ("environments", "interactions", "validation_episodes")
+        "environments": protocol.environments,
+        "interactions": protocol.interactions,
+        "validation_episodes": protocol.validation_episodes,
     }
-    for part in (
-        task["environment"].get("options"),
-        identity.get("algorithm_options"),
-        identity.get("model_options"),
-    ):
-        values |= part or {}
+    for side in (task.environment.options, *sides):
+        values |= side
     return {name: len(value) if isinstance(value, list) else value for name, value in values.items()}
 
 

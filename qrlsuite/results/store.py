@@ -38,14 +38,13 @@ from numpy.typing import NDArray
 
 from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError, UnknownNameError
-from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import EntryTuning
-from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results import genuine, parquet
+from qrlsuite.results.records import FORMAT_VERSION, EntryRecord
 from qrlsuite.specs import NAME
 from qrlsuite.statistics.grid import settled
 
-FORMAT_VERSION = 1
 MEASURED = "measured"
 """Before the name of a metric of the environment in an epoch's record: `measured.violations`."""
 _MARK = re.compile(r"@[0-9a-f]{8}")
@@ -475,10 +474,11 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def _steps(tuning: Mapping[str, Any]) -> int:
-    """Return the environment steps that a record of tuning names; -1 where it does not know them."""
-    steps = tuning.get("steps")
-    return -1 if steps is None else int(steps)
+def _steps(tuning: EntryTuning | None) -> int:
+    """Return the environment steps that a record of tuning names; -1 where it does not know them, -2 without one."""
+    if tuning is None:
+        return -2
+    return -1 if tuning.steps is None else tuning.steps
 
 
 def _epoch(row: Mapping[str, Any], path: Path) -> int:
@@ -589,7 +589,7 @@ class EntryStore:
         """
         store = cls(runs / entry.task.name / f"{entry.name}{mark}")
         genuine.require_no_link(store.path.parent, store.path)
-        if (store.path / "entry.json").exists() and store.record().get("hash") != entry.hash:
+        if (store.path / "entry.json").exists() and store.record().hash != entry.hash:
             raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
         return store
 
@@ -601,65 +601,43 @@ class EntryStore:
         more steps stays; a record without steps gives way to one with steps. `mark` is as for `find`.
         """
         store = cls.find(runs, entry, mark)
-        path = store.path / "entry.json"
-        if not path.exists():
-            write_json(path, entry.record())
+        if not (store.path / "entry.json").exists():
+            store.write_record(EntryRecord.of(entry))
         elif entry.tuning is not None:
             record = store.record()
-            known = record.pop("tuning")
-            if known is None or _steps(known) < _steps(entry.tuning):
-                del record["format_version"]
-                write_json(path, {**record, "tuning": entry.tuning})
+            if _steps(record.tuning) < _steps(EntryTuning(**entry.tuning)):
+                store.write_record(record.changed(tuning=entry.tuning))
         return store
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> EntryRecord:
         """Return `entry.json`."""
         path = self.path / "entry.json"
         genuine.require_no_link(self.path.parent, self.path, path)
-        record = read_json(path)
-        identity = record.get("identity")
-        try:
-            if not isinstance(identity, dict):
-                raise ValueError("it has no identity")
-            named = {
-                **{name: record.get(name) for name in ("name", "hash", "label", "task_name", "task_hash")}
-            }
-            named |= {f"identity.{name}": identity.get(name) for name in ("algorithm", "model")}
-            for name, value in named.items():
-                if not isinstance(value, str):
-                    raise ValueError(f"{name} is not text")
-            genuine.require_entry(record)
-            if record.get("tuning") is not None:
-                tuning = EntryTuning.model_validate(record["tuning"])
-                record["tuning"] = tuning.model_dump(mode="json", exclude_unset=True)
-            TaskFile.model_validate(record.get("task_file"))
-        except (ValueError, RecursionError) as error:  # pydantic's error is a ValueError
-            raise StoreError(f"{path} is not an entry's record: {_first_line(error)}") from None
-        return {"preset": None, "tuning": None, **record}
+        return EntryRecord.read(read_json(path), path)
+
+    def write_record(self, record: EntryRecord) -> None:
+        """Replace `entry.json`."""
+        write_json(self.path / "entry.json", record.content)
 
     @functools.cached_property
-    def names(self) -> dict[str, Any]:
+    def names(self) -> dict[str, str]:
         """Names that each seed's record must have: `entry`, `task`, `task_hash`; empty if `entry.json` is damaged."""
         try:
-            record = read_json(self.path / "entry.json")
+            record = self.record()
         except StoreError:
             return {}
-        return {
-            "entry": record.get("name"),
-            "task": record.get("task_name"),
-            "task_hash": record.get("task_hash"),
-        }
+        return {"entry": record.name, "task": record.task_name, "task_hash": record.task_hash}
 
     def entry(self) -> Entry:
         """Build the entry that the folder belongs to."""
-        if self.record().get("imported"):
+        record = self.record()
+        if record.imported:
             raise StoreError(
                 f"{self.path} holds curves that another program made: they can be compared, not trained, evaluated or "
                 "published"
             )
-        record = self.record()
         try:
-            entry = from_record(record, str(self.path / "entry.json"))
+            entry = record.entry(str(self.path / "entry.json"))
             if isinstance(ansatz := getattr(entry.model_options, "ansatz", None), str):
                 registry.load().get(specs.AnsatzSpec, ansatz)
             return entry
@@ -706,14 +684,12 @@ class EntryStore:
         return done
 
 
-def copies_of_plugins(store: EntryStore, record: Mapping[str, Any]) -> str:
+def copies_of_plugins(store: EntryStore, record: EntryRecord) -> str:
     """Return a hint how to load the copies of plugins in an entry's folder; empty if there are none."""
-    kept = record.get("plugins")
-    places = [str(place) for each in kept.values() for place in each] if isinstance(kept, dict) else []
-    if not places:
+    names = sorted({Path(place).name for places in record.plugins.values() for place in places})
+    if not names:
         return ""
-    names = " and ".join(sorted({Path(place).name for place in places}))
-    return f"; {store.path} has a copy of {names}: if you trust it, add --plugin {store.path}"
+    return f"; {store.path} has a copy of {' and '.join(names)}: if you trust it, add --plugin {store.path}"
 
 
 def plugins_in(runs: Path, unknown: str) -> str:
@@ -727,11 +703,11 @@ def plugins_in(runs: Path, unknown: str) -> str:
     name = unknown.partition("'")[2].partition("'")[0]
     for store in entries(runs) if runs.is_dir() else ():
         try:
-            record = read_json(store.path / "entry.json")
+            record = store.record()
         except StoreError:
             continue
-        if f'"{name}"' in json.dumps(record.get("identity")) and (said := copies_of_plugins(store, record)):
-            return said
+        if f'"{name}"' in json.dumps(record.identity.content) and (hint := copies_of_plugins(store, record)):
+            return hint
     return ""
 
 

@@ -15,6 +15,7 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living, move_away
 from qrlsuite.results.progress import read_progress
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, read_lines, write_json
 from qrlsuite.results.text import duration
@@ -67,17 +68,17 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
     """
     problems: list[str] = []
     try:
-        record = store.record()
+        record: EntryRecord | None = store.record()
     except StoreError as error:
         problems.append(str(error))
-        record = {}
+        record = None
     statuses, epochs = _seeds(store, problems, queued)
     size, newest = _usage(store.path)
     return EntrySurvey(
         folder=store.path,
-        task=str(record.get("task_name", store.path.parent.name)),
+        task=store.path.parent.name if record is None else record.task_name,
         name=store.path.name,
-        label=" ".join([str(record.get("label", "?")), store.mark]).rstrip(),
+        label=" ".join(["?" if record is None else record.label, store.mark]).rstrip(),
         seeds=dict(Counter(statuses.values())),
         epochs=(min(epochs), max(epochs)) if epochs else None,
         size=size,
@@ -94,10 +95,16 @@ def outline(store: EntryStore) -> dict[str, Any]:
     made_with: list[Any] = []
     for run in records:
         made_with += [provenance for provenance in run.get("provenance", []) if provenance not in made_with]
-    keys = ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
     return {
-        **{key: record[key] for key in keys},
-        **({"imported": record["imported"]} if record.get("imported") else {}),
+        "label": record.label,
+        "name": record.name,
+        "hash": record.hash,
+        "preset": record.preset,
+        "tuning": record.tuned,
+        "task_name": record.task_name,
+        "task_hash": record.task_hash,
+        "identity": record.identity.content,
+        **({"imported": record.content["imported"]} if record.imported else {}),
         "seeds": len(seeds),
         "provenance": made_with,
         "parameters": parameters_of(records),

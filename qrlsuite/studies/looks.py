@@ -62,12 +62,14 @@ class Run:
 
     Attributes
     ----------
+    plan:
+        Hash of the study that trains it; None where it is of none.
     curve:
         Shape (T,); None where it has not reached the study's last epoch.
     """
 
     seed: int
-    record: Mapping[str, Any]
+    plan: str | None
     curve: NDArray[np.float64] | None
     hours: float
 
@@ -292,9 +294,9 @@ class StudyWithLooks:
             record = folder.record()
             if record and record.get("status") == "finished" and int(record.get("epochs", 0)) >= self.epochs:
                 run = folder.read()
-                yield Run(seed, record, run.curve[: self.epochs], run.seconds / 3600)
+                yield Run(seed, record.get("plan"), run.curve[: self.epochs], run.seconds / 3600)
             else:
-                yield Run(seed, record or {}, None, folder.seconds() / 3600)
+                yield Run(seed, record.get("plan") if record else self.hash, None, folder.seconds() / 3600)
 
     def read(self) -> StudyState:
         """Read the folder once, and decide by it; writes nothing."""
@@ -303,7 +305,7 @@ class StudyWithLooks:
         for name, entry in self.entries.items():
             runs = list(self.runs_of(name))
             for run in runs:
-                if run.seed in self.looks.block and run.record and run.record.get("plan") != self.hash:
+                if run.seed in self.looks.block and run.plan != self.hash:
                     raise StoreError(
                         f"{EntryStore.find(self.folder, entry).seed(run.seed).path}: seed {run.seed} of '{name}' was "
                         f"not trained by study {self.hash}; delete that folder, and the study trains it"

@@ -154,7 +154,7 @@ class Deployment:
             "epochs": [int((store.seed(seed).record() or {})["epochs"]) for seed in self.seeds],
             "agents": self.seeds,
         }
-        if entry.task.hash != store.record()["task_hash"]:
+        if entry.task.hash != store.record().task_hash:
             self._description["task_hash"] = entry.task.hash
 
     @cached_property

@@ -131,7 +131,7 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
         )
     published = {seed: score for seed, score in last.items() if records[seed].get("agent") is not False}
     last = published or last
-    most = -1 if store.record()["task_file"].get("score", {}).get("goal") == "below" else 1
+    most = -1 if store.record().task_file.score.goal == "below" else 1
     chosen = sorted(last, key=lambda seed: (-most * last[seed], seed))[:count]
     return chosen, [last[seed] for seed in chosen], len(last)
 
@@ -200,7 +200,7 @@ def trained_entry(store: EntryStore, on: Task | None = None) -> Entry:
     on:
         The task that they play, if it is not the one that they were trained on.
     """
-    if store.record().get("imported"):
+    if store.record().imported:
         raise StoreError(
             f"{store.path} was imported from other files, which hold learning curves and no trained parameters: "
             "train the entry here with `qrlsuite run` to evaluate its policies"

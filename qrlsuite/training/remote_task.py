@@ -51,9 +51,9 @@ from safetensors.numpy import load, save
 from qrlsuite import own
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment import identity
-from qrlsuite.experiment.entry import from_record
 from qrlsuite.results import provenance
 from qrlsuite.results.checkpoint import Arrays
+from qrlsuite.results.records import EntryRecord
 
 POLICY = "policy."
 MOST_BYTES = 32 << 20
@@ -151,7 +151,11 @@ def _changed_code(header: Mapping[str, Any]) -> str:
     """Say in what the code here differs from what a task is to be trained with; nothing where it does not."""
     try:
         sent = [dict(part) for part in header["code"]]
-        return listed(identity.differences(sent, identity.of(from_record(header["entry"], "the task")).parts))
+        return listed(
+            identity.differences(
+                sent, identity.of(EntryRecord.read(header["entry"], "the task").entry("the task")).parts
+            )
+        )
     except (QrlSuiteError, KeyError, TypeError, ValueError):  # is said where the entry is built
         return ""
 
@@ -191,7 +195,7 @@ def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tup
     more: dict[str, Any] = {"epoch": header["epoch"], "lines": lines, "timings": timings, "warnings": []}
     answered: Arrays = {}
     try:
-        entry = from_record(header["entry"], "the task")
+        entry = EntryRecord.read(header["entry"], "the task").entry("the task")
         trainer = Trainer(entry, seeds, header["device"])
         more["parameters"] = trainer.models.trained()
         origin = provenance.of(entry, trainer.device)

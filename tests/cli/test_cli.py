@@ -114,7 +114,7 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
 
 
 def label(entry: Path) -> str:
-    return str(EntryStore(entry).record()["label"])
+    return EntryStore(entry).record().label
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM], ids=lambda sign: sign.name)

@@ -86,7 +86,7 @@ class Scripted:
         for group in work.groups:
             if len(self.trained) == self.interrupt_at:
                 raise KeyboardInterrupt
-            width = work.store.record()["label"].split()[-1]
+            width = work.store.record().label.split()[-1]
             for seed in group.seeds:
                 put(work.store, seed, work.epochs, STARTS[width](seed))
             self.trained.append((width, group.seeds[0], len(group.seeds)))
@@ -428,7 +428,7 @@ def test_seeds_of_others_are_refused(refused: Refused) -> None:
 def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:
     run(write())
     stores = map(EntryStore, Path("runs/decisions/widths/tiny").iterdir())
-    slow = next(store for store in stores if store.record()["label"].endswith("width=4"))
+    slow = next(store for store in stores if store.record().label.endswith("width=4"))
     for seed in range(10000, 10020):
         put(slow, seed, 20, STARTS["width=16"](seed))
     message = refused("show", "widths.toml")
@@ -601,7 +601,7 @@ def test_a_study_keeps_the_values_and_the_record_of_a_preset_file() -> None:
     plain, tuned = sorted((entry["name"] for entry in found["entries"]), key=len)
     assert (plain, tuned) == ("mlp width=16", "mlp width=16 input_scale=3.0 lr=0.002")
     stores = [EntryStore(path) for path in Path("runs/decisions/p/tiny").iterdir()]
-    records = {store.record()["label"].split(" ", 1)[1]: store.record().get("tuning") for store in stores}
+    records = {store.record().label.split(" ", 1)[1]: store.record().tuned for store in stores}
     assert records[plain] is None
     assert (records[tuned]["trials"], records[tuned]["preset"]) == (3, "tuned.toml")
 

@@ -149,9 +149,7 @@ def test_a_record_that_names_other_files_is_refused(trained: Path) -> None:
     for place in ("../../../evil.py", str(trained / "evil.py"), "plugins/../../../../evil.py"):
         record["plugins"] = {code: [place] for code in record["plugins"]}
         path.write_text(json.dumps(record))
-        assert "plugins names no copies of plugins; restore the file" in run(
-            trained, plugin=str(entry), code=2
-        )
+        assert f"{place!r}: no copy of a plugin; restore the file" in run(trained, plugin=str(entry), code=2)
     assert not (trained / "it-ran").exists()
     run(trained, "--seeds", "3", code=2)
 

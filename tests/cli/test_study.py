@@ -80,7 +80,7 @@ class Here:
         [work] = works
         for group in work.groups:
             train_group(work.store.path, group.seeds, work.epochs)
-            self.trained.append((work.store.record()["label"], group.seeds))
+            self.trained.append((work.store.record().label, group.seeds))
         return EngineOutcome()
 
 

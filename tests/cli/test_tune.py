@@ -66,7 +66,7 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(
     )  # fmt: skip
     assert used.returncode == 0, used.stderr
     store = EntryStore(Path(json.loads(used.stdout)["folder"]))
-    assert store.record()["tuning"]["seeds"] == "1000000:1000001"
+    assert store.record().tuning.seeds == "1000000:1000001"
     shown = answer("show", str(store.path))
     for name in (store.path.name, f"{store.path.parent.name}/{shown['label']}"):
         assert answer("show", name, "--runs", str(store.path.parents[1])) == shown

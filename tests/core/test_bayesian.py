@@ -181,7 +181,7 @@ def test_with_real_training_two_models_are_searched_until_the_same_regret(
         said = entry.tuning["regret"]
         assert said["goal"] == 0.05
         assert _tuned_text(entry.tuning).endswith(f"regret {said['expected']:.0%})")
-        assert EntryStore.create(tmp_path / "runs", entry).record()["tuning"] == entry.tuning
+        assert EntryStore.create(tmp_path / "runs", entry).record().tuned == entry.tuning
 
 
 def test_core_hours_are_kept(tiny_task: str, tmp_path: Path) -> None:

@@ -17,10 +17,11 @@ import pytest
 from safetensors.numpy import load_file
 
 from qrlsuite.engine.worker import train_group
-from qrlsuite.experiment.entry import from_record, resolve
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.results.codes import ChangedCodeError
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore, json_line
 from tests.golden.make import EPOCHS, GOLDEN, SEEDS, machine
 
@@ -55,11 +56,13 @@ def test_tasks_and_plain_commands_keep_their_hashes(version: Path) -> None:
 @pytest.mark.parametrize("version", VERSIONS, ids=lambda path: path.name)
 def test_published_entries_keep_their_hashes(version: Path) -> None:
     for record in stored(version, "hashes")["published"]:
-        entry = from_record(record, record["name"])  # raises where the hash is another one
+        entry = EntryRecord.read(record, record["name"]).entry("")  # raises where the hash is another one
         kept = ("name", "hash", "label", "task_hash", "identity")
-        assert {name: entry.record()[name] for name in kept} == {name: record[name] for name in kept}
+        assert {name: EntryRecord.of(entry).content[name] for name in kept} == {
+            name: record[name] for name in kept
+        }
         there = EntryStore(PUBLISHED / record["task_name"] / record["name"]).record()
-        assert {name: there[name] for name in kept} == {name: record[name] for name in kept}
+        assert {name: there.content[name] for name in kept} == {name: record[name] for name in kept}
 
 
 @pytest.mark.parametrize("run", RUNS, ids=lambda path: path.name)

@@ -18,6 +18,7 @@ from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results import probes
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER
@@ -375,7 +376,7 @@ def test_a_task_file_names_its_plugins(tiny_task: str) -> None:
     here = write("here.toml", f'plugins = ["code/ring.py"]\n{text}')
     assert task.load(here).hash == task.load(tiny_task).hash
     assert names() == {"ansatz": ["ring"]}
-    assert "plugins" not in resolve(here, "mlp").record()["task_file"]
+    assert "plugins" not in EntryRecord.of(resolve(here, "mlp")).content["task_file"]
     for bad in ('"ring.py"', "[1]", '[""]'):
         with pytest.raises(FileError, match=r"plugins = .*name files and folders"):
             task.load(write("bad.toml", f"plugins = {bad}\n{text}"))
@@ -413,7 +414,7 @@ def test_a_task_of_a_remote_worker_brings_its_plugins() -> None:
         own.load(write("ring.py", RING.replace('"RY"', f'"{gate}"')))
         entry = resolve("beam6g", "vqc-native ansatz=ring qubits=2 layers=1")
         packed = [each.packed() for each in identity.plugins(entry)]
-        entry_of[gate] = entry.record(), identity.of(entry).record()["parts"], packed
+        entry_of[gate] = EntryRecord.of(entry).content, identity.of(entry).record()["parts"], packed
     own.unload(own.loaded()[0])
     for gate in ("RY", "RZ", "RY"):
         record, parts, packed = entry_of[gate]

@@ -18,12 +18,13 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options, registry, specs
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import PluginError
-from qrlsuite.experiment.entry import Entry, from_record, resolve
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import Since
 from qrlsuite.plugins.algorithms import ddqn
 from qrlsuite.plugins.circuits import ansatz
 from qrlsuite.plugins.environments.beam6g import options as beam6g
 from qrlsuite.plugins.models import mlp, vqc
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from tests.conftest import Train, results
 
@@ -95,7 +96,9 @@ def facts(entry: Entry) -> tuple[Any, ...]:
 
 def test_at_their_defaults_they_change_nothing(tiny_task: str, upgrade: Callable[[], None]) -> None:
     before = facts(resolve(tiny_task, "mlp")), facts(resolve(tiny_task, "vqc-native"))
-    record = resolve(tiny_task, "mlp", settings=words("degree=4", "width=32", "lr=1e-3")).record()
+    record = EntryRecord.of(
+        resolve(tiny_task, "mlp", settings=words("degree=4", "width=32", "lr=1e-3"))
+    ).content
     upgrade()
     assert (facts(resolve(tiny_task, "mlp")), facts(resolve(tiny_task, "vqc-native"))) == before
     given = words("dropout=0.0", "warm_up=0", "wind=[]", "layers=[{}]")
@@ -103,7 +106,7 @@ def test_at_their_defaults_they_change_nothing(tiny_task: str, upgrade: Callable
     given = words("ansatz_options={twirl = false}")
     assert facts(resolve(tiny_task, "vqc-native", settings=given)) == before[1]
     stored = json.loads(json.dumps(record))
-    assert facts(from_record(stored, "record")) == (
+    assert facts(EntryRecord.read(stored, "record").entry("record")) == (
         *(stored[name] for name in ("hash", "name", "label", "task_hash", "identity")),
     )
 
@@ -126,7 +129,7 @@ def test_at_other_values_they_are_covered(
     assert changed.hash != before.hash
     assert label in changed.label
     assert (changed.task.hash != before.task.hash) == task_changes
-    assert facts(from_record(changed.record(), "record")) == facts(changed)
+    assert facts(EntryRecord.of(changed).entry("record")) == facts(changed)
 
 
 def test_options_of_an_ansatz_are_covered_where_they_are_used(

@@ -12,9 +12,10 @@ import pytest
 import qrlsuite
 from qrlsuite import registry
 from qrlsuite.errors import FileError
-from qrlsuite.experiment.entry import Entry, from_record, resolve
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.results import provenance, speed
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.speed import Estimate, Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import StudySpec
@@ -125,7 +126,7 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
         record = json.loads(file.read_text())
         if {provenance.device_kind(made) for made in record["published"]["provenance"]} != {"cpu"}:
             continue  # hours of a GPU are no core-hours
-        entry = from_record(record, str(file))
+        entry = EntryRecord.read(record, file).entry(str(file))
         hours = record["published"]
         if any(
             made.get("numerics", {}).get("model", 1) != entry.model.numerics for made in hours["provenance"]

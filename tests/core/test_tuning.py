@@ -18,6 +18,7 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.options import parse_setting
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning import objective, samplers, search, space
 from tests.conftest import TINY
@@ -125,12 +126,12 @@ def test_the_preset_is_the_best_trial_and_the_entry_says_so(tiny_task: str, tmp_
 
     untuned = resolve(tiny_task, "mlp", settings=[*SETTINGS, *space.settings(found.best.point)])
     store = EntryStore.create(tmp_path / "runs", untuned)
-    assert store.record()["tuning"] is None
+    assert store.record().tuned is None
     EntryStore.create(tmp_path / "runs", entry)
-    assert store.record()["tuning"]["trials"] == 4, "an entry that was there before learns that it was tuned"
+    assert store.record().tuning.trials == 4, "an entry that was there before learns that it was tuned"
     assert store.entry().tuning == entry.tuning
     EntryStore.create(tmp_path / "runs", untuned)
-    assert store.record()["tuning"]["trials"] == 4, "and does not forget it"
+    assert store.record().tuning.trials == 4, "and does not forget it"
 
 
 def test_the_preset_names_the_gpu_that_trained_its_trials(tiny_task: str, tmp_path: Path) -> None:
@@ -185,16 +186,16 @@ def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
     assert entry.task.hash == resolve(str(path), "mlp").task.hash
     assert resolve(str(path), "mlp", preset="mine").tuning is None, "nothing is said of networks"
     assert resolve(str(path), circuit).tuning is None, "it is not the default"
-    assert "tuning" not in entry.record()["task_file"], "older versions read the record"
+    assert "tuning" not in EntryRecord.of(entry).content["task_file"], "older versions read the record"
 
     store = EntryStore.create(tmp_path / "runs", dataclasses.replace(entry, tuning=None))
-    assert store.record()["tuning"] is None
+    assert store.record().tuned is None
     EntryStore.create(tmp_path / "runs", entry)
-    assert store.record()["tuning"] == entry.tuning
+    assert store.record().tuned == entry.tuning
     counted = dataclasses.replace(entry, tuning={**entry.tuning, "steps": 100})
     EntryStore.create(tmp_path / "runs", counted)
     EntryStore.create(tmp_path / "runs", entry)
-    assert store.record()["tuning"]["steps"] == 100, "a record that knows its steps stays"
+    assert store.record().tuning.steps == 100, "a record that knows its steps stays"
 
 
 @pytest.mark.parametrize(
@@ -202,25 +203,26 @@ def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
 )
 def test_published_entries_carry_the_tuning_of_the_preset_they_use(path: Path) -> None:
     record = EntryStore(path.parent).record()
-    model = record["identity"]["model"]
+    model = record.identity.model
     entry = resolve("cartpole", {"mlp": "mlp width=16 depth=1"}.get(model, f"{model} qubits=4 layers=1"))
-    assert (entry.name, entry.preset) == (path.parent.name, record["preset"])
-    assert record["tuning"] == entry.tuning
-    assert (record["tuning"]["trials"], record["tuning"]["seeds"]) == (7, "1000000:1000010")
-    assert not record["tuning"]["on_protocol_seeds"]
+    assert (entry.name, entry.preset) == (path.parent.name, record.preset)
+    assert record.tuned == entry.tuning
+    assert record.tuning is not None
+    assert (record.tuning.trials, record.tuning.seeds) == (7, "1000000:1000010")
+    assert not record.tuning.on_protocol_seeds
 
 
 def test_a_record_of_tuning_in_an_entry_is_checked_and_marked(tmp_path: Path) -> None:
     shutil.copy(PUBLISHED / "beam6g" / "ddqn-mlp-333341ef" / "entry.json", tmp_path)
     store, record = EntryStore(tmp_path), json.loads((tmp_path / "entry.json").read_text())
-    assert store.record()["tuning"] == record["tuning"], "nulls are what is not known"
+    assert store.record().tuned == record["tuning"], "nulls are what is not known"
 
     def rewritten(**changes: Any) -> EntryStore:
         tuning = {**record["tuning"], **changes}
         (tmp_path / "entry.json").write_text(json.dumps({**record, "tuning": tuning}))
         return store
 
-    marked = rewritten(on_protocol_seeds=False).record()["tuning"]
+    marked = rewritten(on_protocol_seeds=False).record().tuned
     assert marked["on_protocol_seeds"], "its seeds say so, whatever it says itself"
     for changes in ({"trials": "many"}, {"trails": 3}, {"steps": -1}):
         with pytest.raises(StoreError, match="is not an entry's record"):

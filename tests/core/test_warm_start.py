@@ -21,6 +21,7 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.boards import tables
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.export import export
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training.remote_task import POLICY, pack, unpack, versions, work_on
 from qrlsuite.training.trainer import Trainer
@@ -155,7 +156,7 @@ def test_workers_without_a_shared_folder_and_the_probe_begin_alike(root: Path) -
     _, warm = stores(root)
     entry = warm.entry()
     header: dict[str, Any] = {
-        "token": "t", "entry": entry.record(), "seeds": [0, 1], "epoch": 0, "epochs": 2, "seconds": 1e9,
+        "token": "t", "entry": EntryRecord.of(entry).content, "seeds": [0, 1], "epoch": 0, "epochs": 2, "seconds": 1e9,
         "device": "cpu", "versions": versions(entry.distributions()), "code": identity.of(entry).parts, "plugins": [],
     }  # fmt: skip
     answer, arrays = unpack(work_on(pack(header, warm.initial([0, 1]))))
@@ -239,4 +240,4 @@ def test_it_is_not_published(root: Path) -> None:
 def test_entries_without_agents_are_as_before(train: Train) -> None:
     entry: Entry = EntryStore(train("runs", [0], 1)).entry()
     assert entry.start is None
-    assert "from" not in json.dumps(entry.record())
+    assert "from" not in json.dumps(EntryRecord.of(entry).content)

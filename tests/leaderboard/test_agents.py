@@ -117,7 +117,7 @@ def test_agents_are_added_to_an_entry_with_the_same_curves(folder: Path, tmp_pat
     found = published.read(bare)
     assert found.agents == (0, 2)
     assert found.seeds == SEEDS
-    stated = found.record["published"]
+    stated = found.published.content
     assert len(stated["agents"]["provenance"]) == 1
     assert {**stated, "agents": None} == {**record["published"], "agents": None}
     assert all((bare / name).read_bytes() == before[name] for name in ("curves.parquet", "seeds.parquet"))
@@ -170,9 +170,9 @@ CASES: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "missing": (lambda f: (f / published.AGENTS).unlink(), "agents.safetensors is missing"),
     "not named": (lambda f: state(f, lambda p: p.pop("agents")), "entry.json does not name it"),
-    "strange seeds": (lambda f: state(f, lambda p: p["agents"].update(seeds=[0, 1, 9])), "does not name seeds"),
-    "seeds of text": (lambda f: state(f, lambda p: p["agents"].update(seeds="012")), "does not name seeds"),
-    "no hash": (lambda f: state(f, lambda p: p["agents"].pop("sha256")), "does not name seeds"),
+    "strange seeds": (lambda f: state(f, lambda p: p["agents"].update(seeds=[0, 1, 9])), "are its seeds"),
+    "seeds of text": (lambda f: state(f, lambda p: p["agents"].update(seeds="012")), "published.agents.seeds = '012'"),
+    "no hash": (lambda f: state(f, lambda p: p["agents"].pop("sha256")), "missing key 'published.agents.sha256'"),
 }  # fmt: skip
 
 

@@ -127,7 +127,7 @@ def test_unequal_steps_take_the_last_score_at_or_before_each_grid_point(tmp_path
 def test_a_grid_is_round_where_every_run_has_begun(tmp_path: Path) -> None:
     runs = {"a": ([0, 1], [[1.0, 2.0, 4.0], [1.5, 2.5, 3.0]])}
     [a] = api.import_curves(runs, steps=[130, 900, 1500], thresholds=[2], runs=tmp_path)
-    assert a.store.record()["task_file"]["protocol"]["interactions"] == 200
+    assert a.store.record().task_file.protocol.interactions == 200
     assert a.store.seed(0).read().curve.tolist() == [1, 1, 1, 1, 2, 2, 2]
 
 
@@ -135,7 +135,7 @@ def test_runs_of_different_length_are_named(tmp_path: Path) -> None:
     path = ending(tmp_path / "curves.csv", 30, 30, 20)
     [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
     assert "seeds 2:3 end before the others, from step 20 on (others at 30)" in a.notes[1]
-    assert a.store.record()["task_file"]["ranking"]["horizons"] == [30]
+    assert a.store.record().task_file.ranking.horizons == [30]
     assert api.load("a", runs=tmp_path / "runs").left_out == (2,)
 
 
@@ -146,7 +146,7 @@ def test_runs_that_end_a_little_apart_are_cut_to_one_length(tmp_path: Path) -> N
     assert a.notes[0] == "'a': all cut to step 180; the longest goes on to 200"
     entry = api.load("a", runs=tmp_path / "runs")
     assert (entry.curves.shape, entry.seeds, entry.left_out) == ((3, 18), (0, 1, 2), (3,))
-    assert a.store.record()["task_file"]["ranking"]["horizons"] == [180]
+    assert a.store.record().task_file.ranking.horizons == [180]
 
 
 def test_scores_and_grid_of_a_task_of_the_suite(tmp_path: Path) -> None:

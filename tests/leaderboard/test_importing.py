@@ -84,7 +84,7 @@ def test_only_what_is_missing_is_trained_and_seeds_go_on(elsewhere: Path, task: 
     assert files(own.seed(0).path) == files(source.seed(0).path)
     assert files(own.seed(1).path) == before
     assert [group.seeds for group in plan_groups(own, range(3), 2, 1)] == [(2,)]
-    assert own.record()["tuning"]["trials"] == 3, "the record of tuning travels"
+    assert own.record().tuning.trials == 3, "the record of tuning travels"
     assert (take(elsewhere, runs).new, own.seeds()) == ((), [0, 1])
     train_group(own.path, [0], 3)
     straight = create(task, tmp_path / "straight")

@@ -336,7 +336,7 @@ def test_a_task_names_its_rule_and_the_command_overrides(
     assert ruled.file.model_dump(mode="json")["ranking"]["rule"] == "times"
 
     path = train("runs", range(2), 3)
-    assert EntryStore(path).record()["task_file"]["ranking"]["rule"] == "times"
+    assert EntryStore(path).record().task_file.ranking.rule == "times"
     words = ["leaderboard", "--runs", str(path.parent.parent), "--format", "json"]
     for more, rule in (([], "times"), (["--rule", "intervals"], "intervals")):
         result = say(*words, *more)

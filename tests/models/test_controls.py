@@ -175,9 +175,7 @@ def test_fixed_parameters_stay_and_a_resumed_run_ends_alike(model: str, train: T
 
 def agent_of(folder: Path, model: str) -> nn.Module:
     """The untrained population of an entry's first seed."""
-    from qrlsuite.experiment.entry import from_record
-
-    made = from_record(EntryStore(folder).record(), "test")
+    made = EntryStore(folder).entry()
     trainer = Trainer(made, [0])
     return trainer.models.built[0]
 

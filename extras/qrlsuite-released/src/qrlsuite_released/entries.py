@@ -181,15 +181,15 @@ def _write(
     write_atomically(folder.table, table_bytes(rows))
     folder.write_record(
         {
-            "task": entry["task_name"],
-            "task_hash": entry["task_hash"],
-            "entry": entry["name"],
-            "label": entry["label"],
-            "algorithm": entry["identity"]["algorithm"],
+            "task": entry.task_name,
+            "task_hash": entry.task_hash,
+            "entry": entry.name,
+            "label": entry.label,
+            "algorithm": entry.identity.algorithm,
             "algorithm_options": {},
             "model": MODEL,
             "family": "quantum" if parameters["quantum"] else "classical",
-            "model_options": entry["identity"]["model_options"],
+            "model_options": entry.identity.model_options,
             "parameters": parameters,
             "seed": seed,
             "status": "finished",

@@ -1,0 +1,378 @@
+"""Records as types: who writes one builds it, who reads one gets it, and one that is damaged is refused here.
+
+    entry.json     EntryRecord: what was run; of a published entry with `published`
+
+A record has the known keys of its file as attributes. `content` is all of it, in the order of the file, with keys of
+later versions: that is written again. A key that may be absent has a default, with which older records are read.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import pydantic
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    model_validator,
+)
+
+from qrlsuite import files, notation, options, registry, specs
+from qrlsuite.errors import StoreError
+from qrlsuite.experiment.entry import START_FORM, Entry
+from qrlsuite.experiment.identity import CodeIdentity
+from qrlsuite.experiment.preset import EntryTuning
+from qrlsuite.experiment.task import Task, TaskFile, digest
+
+FORMAT_VERSION = 1
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("not one line of text")
+    return text
+
+
+def _sorted_once(names: list[Any]) -> list[Any]:
+    if names != sorted(set(names)):
+        raise ValueError("not sorted, each once")
+    return names
+
+
+Line = Annotated[str, AfterValidator(_one_line)]
+Count = Annotated[int, Field(strict=True, ge=0, lt=10**12)]
+Positive = Annotated[int, Field(strict=True, ge=1, lt=10**9)]
+Name = Annotated[str, Field(pattern=specs.WHOLE_NAME)]
+
+
+class Record(pydantic.BaseModel):
+    """A JSON object of a file.
+
+    Attributes
+    ----------
+    what:
+        What the whole file is, for messages.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, populate_by_name=True)
+    what: ClassVar[str] = "a record"
+    _content: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _keep(cls, content: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        record = validate(content)
+        if record is not content:
+            record._content = {name: _plain(value) for name, value in content.items()}
+        return record
+
+    @classmethod
+    def read(cls, content: Any, source: Path | str) -> Self:
+        """Read the content of a file; what does not fit is refused with its key."""
+        try:
+            return cls.model_validate(content)
+        except pydantic.ValidationError as error:
+            problems = "; ".join(files.problems(error, cls))
+        except RecursionError:
+            problems = "too many nested tables"
+        text = " ".join(problems.split())[:300]
+        raise StoreError(f"{source} is not {cls.what}: {text}; restore the file")
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The whole object, as plain values in the order of the file; not to be changed."""
+        return self._content
+
+    def changed(self, **values: Any) -> Self:
+        """Return the record with other values of some keys."""
+        return type(self).model_validate({**self._content, **values})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Record):
+        return value.content
+    return [_plain(each) for each in value] if isinstance(value, list) else value
+
+
+class CodePart(Record):
+    """One part of a code identity, see `qrlsuite.experiment.identity`."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    role: str
+    name: str
+    distribution: str | None = None
+    numerics: int | None = None
+    circuit: str | None = None
+    sha256: str | None = None
+    files: dict[str, str] = {}
+
+
+class CodeRecord(Record):
+    """The code that computes an entry's numbers."""
+
+    digest: str
+    parts: list[CodePart]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.identity.digest != self.digest:
+            raise ValueError("its parts do not have its digest")
+        return self
+
+    @property
+    def identity(self) -> CodeIdentity:
+        """The code identity."""
+        return CodeIdentity(tuple(part.content for part in self.parts))
+
+
+class CodedRecord(Record):
+    """A record that names the code of its seeds; None where that was not recorded."""
+
+    code: CodeRecord | None = None
+
+    @property
+    def code_identity(self) -> CodeIdentity | None:
+        """The identity of the code, where it was recorded."""
+        return None if self.code is None else self.code.identity
+
+
+class SameCodeRecord(Record):
+    """A declaration that codes, named by their digests, do the same."""
+
+    codes: list[str]
+    reason: str = ""
+    time: str = ""
+
+
+class EntryIdentity(Record):
+    """What an entry's hash covers.
+
+    Attributes
+    ----------
+    task:
+        The task's definition.
+    start:
+        See `qrlsuite.experiment.entry.Entry`.
+    """
+
+    task: dict[str, Any]
+    algorithm: str
+    algorithm_options: dict[str, Any]
+    model: str
+    model_options: dict[str, Any]
+    start: Annotated[str | None, Field(alias=notation.START, pattern=f"^(?:{START_FORM.pattern})$")] = None
+
+
+class ImportedRecord(Record):
+    """From what curves of another program were made."""
+
+    grid: str = ""
+    maximum: float | None = None
+
+
+def _told(imported: Any) -> Any:
+    """Accept the records of `import-released`, which say nothing more."""
+    return {} if imported is True else imported
+
+
+class ProbeRecord(Record):
+    """What a probe of independent seeds found (`qrlsuite.engine.probe`).
+
+    Attributes
+    ----------
+    seed, epochs:
+        The seed that was trained alone, and up to which epoch.
+    difference:
+        In what it differed.
+    reason:
+        Why nothing was probed.
+    seconds, cpu:
+        What the probe took, by the clock and of processor time.
+    """
+
+    result: Literal["equal", "differs", "not probed"]
+    seed: int | None = None
+    epochs: int | None = None
+    difference: str | None = None
+    reason: str | None = None
+    seconds: float | None = None
+    cpu: float | None = None
+
+
+class AgentsRecord(Record):
+    """The agents of a published entry: whose they are, the SHA-256 of their file, and with what they were made."""
+
+    sha256: str
+    seeds: Annotated[list[Count], Field(min_length=1), AfterValidator(_sorted_once)]
+    provenance: list[dict[str, Any]] = []
+
+
+def _counted(parameters: dict[str, int]) -> dict[str, int]:
+    if missing := {"classical", "quantum"} - parameters.keys():
+        raise ValueError(f"{' and '.join(sorted(missing))} missing")
+    return parameters
+
+
+def _independent(probe: ProbeRecord) -> ProbeRecord:
+    if probe.result == "differs":
+        raise ValueError("not the result of a probe that found seeds independent")
+    return probe
+
+
+class PublishedRecord(Record):
+    """What a published entry says beside what was run.
+
+    Attributes
+    ----------
+    seeds, epochs:
+        How many.
+    parameters:
+        See `qrlsuite.results.store.parameters_of`.
+    provenance:
+        Different ones; each seed names its own.
+    diverged:
+        By seed, the first epoch after which its agent's numbers were not finite.
+    measured:
+        The metrics of the environment.
+    """
+
+    seeds: Positive
+    epochs: Positive
+    parameters: Annotated[dict[str, Count], AfterValidator(_counted)]
+    core_hours: float | None = None
+    circuit_executions: Count | None = None
+    provenance: Annotated[list[dict[str, Any]], Field(min_length=1)]
+    diverged: dict[str, Positive] = {}
+    probe: Annotated[ProbeRecord, AfterValidator(_independent)] | None = None
+    agents: AgentsRecord | None = None
+    measured: Annotated[list[Name], Field(max_length=100), AfterValidator(_sorted_once)] = []
+
+
+PLUGINS = "plugins"
+"""The folder, in an entry's, of copies of plugins by path: each in a folder named by its content."""
+
+_COPY = re.compile(rf"{PLUGINS}/[0-9a-f]{{16}}/[A-Za-z_][A-Za-z0-9_]*(\.py)?")
+
+
+def _place_of_copy(place: str) -> str:
+    if not _COPY.fullmatch(place):
+        raise ValueError("no copy of a plugin")
+    return place
+
+
+class EntryRecord(CodedRecord):
+    """What was run: enough to build the entry again anywhere.
+
+    Attributes
+    ----------
+    task_file:
+        The task as it was when the entry was first run.
+    same:
+        What its author declared about its codes.
+    plugins:
+        Where its copies of plugins by path are, by the digest of the code that they belong to.
+    imported:
+        Of curves that another program made.
+    """
+
+    what: ClassVar[str] = "an entry's record"
+
+    name: Line
+    hash: str
+    label: Line
+    preset: str | None = None
+    tuning: EntryTuning | None = None
+    plan: str | None = None
+    imported: Annotated[ImportedRecord | None, BeforeValidator(_told)] = None
+    task_name: Line
+    task_hash: str
+    task_file: TaskFile
+    identity: EntryIdentity
+    same: list[SameCodeRecord] = []
+    plugins: dict[str, list[Annotated[str, AfterValidator(_place_of_copy)]]] = {}
+    published: PublishedRecord | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Refuse hashes and a name that do not stand for what was run."""
+        identity = self.identity
+        if digest(identity.task) != self.task_hash:
+            raise ValueError("the task's definition does not have its hash")
+        if digest(identity.content) != self.hash:
+            raise ValueError("the options do not have the entry's hash")
+        expected = f"{identity.algorithm}-{identity.model}-{self.hash[:8]}"
+        if self.name != expected:
+            raise ValueError(f"it is named {self.name!r}, and should be {expected!r}")
+        return self
+
+    @classmethod
+    def of(cls, entry: Entry) -> EntryRecord:
+        """Return the record of an entry."""
+        tuned = {} if entry.tuning is None else {"tuning": entry.tuning}
+        planned = {} if entry.plan is None else {"plan": entry.plan}
+        file = entry.task.file.model_dump(mode="json", exclude={"tuning"})
+        if entry.task.name in registry.load().of(specs.TaskSpec):
+            file["ranking"].pop("policies", None)  # boards read the registered file; 0.1.1 knows no such key
+        return cls.model_validate(
+            {
+                "name": entry.name,
+                "hash": entry.hash,
+                "label": entry.label,
+                "preset": entry.preset,
+                **tuned,
+                **planned,
+                "task_name": entry.task.name,
+                "task_hash": entry.task.hash,
+                "task_file": file,
+                "identity": entry.identity,
+            }
+        )
+
+    @property
+    def tuned(self) -> dict[str, Any] | None:
+        """The record of tuning as plain values; seeds that entries are judged by are marked in it."""
+        return None if self.tuning is None else self.tuning.model_dump(mode="json", exclude_unset=True)
+
+    @property
+    def maximum(self) -> float | None:
+        """The best possible score, where curves of another program were divided by it."""
+        return None if self.imported is None else self.imported.maximum
+
+    @property
+    def same_codes(self) -> list[list[str]]:
+        """The digests that were declared to be the same, one list for each declaration."""
+        return [declared.codes for declared in self.same]
+
+    def entry(self, source: str) -> Entry:
+        """Build the entry; `source` is where the record came from, for messages."""
+        task = Task(self.task_file, source)
+        task.name = self.task_name
+        algorithm = registry.get(specs.AlgorithmSpec, self.identity.algorithm)
+        model = registry.get(specs.ModelSpec, self.identity.model)
+        sides = (algorithm, self.identity.algorithm_options), (model, self.identity.model_options)
+        algorithm_options, model_options = (
+            options.build(specs.resolve(spec.options), dict(values), source) for spec, values in sides
+        )
+        entry = Entry(
+            task=task,
+            algorithm=algorithm,
+            model=model,
+            algorithm_options=algorithm_options,
+            model_options=model_options,
+            preset=self.preset,
+            tuning=self.tuned,
+            plan=self.plan,
+            start=self.identity.start,
+        )
+        if entry.hash != self.hash:
+            raise StoreError(
+                f"{source} was made by a version of the suite or a plugin in which its options meant something else "
+                f"(hash {self.hash}, now {entry.hash}): keep it for reading, and choose another folder with --runs"
+            )
+        return entry
