@@ -268,7 +268,7 @@ def test_an_entry_shows_once_what_made_all_its_seeds(kept: Train) -> None:
     entry = kept("runs", [0, 1, 2], epochs=1)
     shown = answer("show", entry.name, "--runs", str(entry.parents[1]))
     record = store.EntryStore(entry).record()
-    assert (shown["label"], shown["seeds"]) == (record["label"], 3)
+    assert (shown["label"], shown["seeds"]) == (record.label, 3)
     [origin] = shown["provenance"]
     assert origin["versions"]["qrlsuite"] == qrlsuite.__version__
 
