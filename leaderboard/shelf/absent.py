@@ -7,7 +7,7 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 
 def absent(entry: EntryResults) -> list[str]:
-    """Return what would be needed to train an entry further and nothing registers, in words: `model 'fourier'`."""
+    """Name the parts that an entry needs for further training and nothing registers: `model 'fourier'`."""
     if entry.external:
         return []
     known = registry.load()

@@ -16,7 +16,7 @@ from qrlsuite.leaderboard.shelf.published import AGENTS, CURVES, SEEDS
 from qrlsuite.studies.looks import FILE, LOG
 
 PLACES = ("leaderboard/entries", "leaderboard/unranked", "leaderboard/plans")
-"""Where a repository keeps what is published."""
+"""A repository's folders of published files."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9+._-]*")
 _OF_ENTRY, _OF_STUDY = ("entry.json", CURVES, SEEDS, AGENTS), (FILE, LOG)
@@ -25,13 +25,13 @@ _OF_ENTRY, _OF_STUDY = ("entry.json", CURVES, SEEDS, AGENTS), (FILE, LOG)
 def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
     """Return the folders of entries, and of studies, in which a checkout differs from a commit; both sorted.
 
-    Files that git does not track yet count, those that it ignores do not. So do entries that are gone, as a whole or
-    one file of them: removing what others published is no change that passes unseen.
+    Files that git does not track yet count; files that it ignores do not. Removed entries and removed files of entries
+    count, too: nobody removes published files unseen.
 
     Parameters
     ----------
     base:
-        A commit, or what names one to git: `origin/main`, `HEAD~1`.
+        A commit, by any of its names in git: `origin/main`, `HEAD~1`.
     checkout:
         The repository's folder, or one below it.
     """
@@ -62,7 +62,7 @@ def _commit(base: str, root: Path) -> str:
 
 
 def _git(folder: Path, *words: str) -> str:
-    """Return what git prints; bytes that are no UTF-8 become surrogates, as in any path."""
+    """Return git's output; bytes that are no UTF-8 become surrogates, as in any path."""
     try:
         done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, check=True)
     except OSError as error:
@@ -74,7 +74,7 @@ def _git(folder: Path, *words: str) -> str:
 
 
 def _problem(root: Path, name: str) -> str | None:
-    """Say why a path is none of a published file, None where it is one."""
+    """Return why a path is not a published file's path, None if it is one."""
     place = next(place for place in PLACES if f"{name}/".startswith(f"{place}/"))
     parts = name[len(place) + 1 :].split("/")
     strange = next((part for part in parts if not _NAME.fullmatch(part)), None)

@@ -23,18 +23,18 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class Selection:
-    """From where entries are read, and which of them.
+    """The entries to read, and their source.
 
     Attributes
     ----------
     runs:
         The results folder.
     published:
-        With the published entries that come with the suite. `runs` need not exist then.
+        Whether to read the published entries that come with the suite, too. `runs` need not exist then.
     tasks:
-        The entries of these tasks; of all where empty. Their names, or before `named` what the user wrote.
+        The tasks whose entries are read, all if empty: their names, or before `named` the user's words.
     only:
-        These entries alone, of studies or not, whatever their task; None for the entries that boards rank.
+        The only entries to read, of studies or not, whatever their task; None for the entries that boards rank.
     """
 
     runs: Path
@@ -46,7 +46,7 @@ class Selection:
     def create(
         cls, runs: str | PathLike[str], task: str | Sequence[str] | None = None, published: bool = False
     ) -> Selection:
-        """Make a selection from the arguments of a command or of `qrlsuite.api`, with tasks as they are written."""
+        """Make a selection from the arguments of a command or of `qrlsuite.api`; tasks stay in the user's words."""
         return cls(Path(runs), published, (task,) if isinstance(task, str) else tuple(task or ()))
 
     def of(self, *tasks: str) -> Selection:
@@ -59,26 +59,25 @@ class Selection:
 
     @property
     def folders(self) -> list[Path]:
-        """The results folder, and those of published entries."""
+        """The results folder, and the folders of published entries."""
         return [self.runs, *(published_entries.folders() if self.published else ())]
 
     @property
     def of_tasks(self) -> str:
-        """Say which tasks: ` of task beam6g or cartpole`, empty for all."""
+        """Name the tasks: ` of task beam6g or cartpole`, empty for all."""
         return f" of task {' or '.join(sorted(self.tasks))}" if self.tasks else ""
 
 
 def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
     """Read every selected entry.
 
-    An entry that is in the results folder and published is shown once, the copy with more seeds: equal seeds are the
-    same runs, not further evidence. Where the own copy gets less far towards the task's shortest horizon, both are
-    shown.
+    An entry in the results folder that is also published is shown once, as the copy with more seeds: equal seeds are
+    equal runs, not further evidence. If the own copy is shorter within the task's shortest horizon, both are shown.
 
     Returns
     -------
     tuple
-        The entries that have at least one epoch, and one line for each folder that was refused and why.
+        The entries that have at least one epoch, and one line with the reason for each refused folder.
     """
     tasks, only = selection.tasks, selection.only
     good: dict[tuple[str, str, str], list[EntryResults]] = {}
@@ -116,7 +115,7 @@ def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
 
 
 BESIDE = "-published"
-"""Behind the name of a published entry that stands beside own runs of it."""
+"""End of a published entry's name that stands beside own runs of that entry."""
 
 
 def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
@@ -133,9 +132,9 @@ def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
 
 
 def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
-    """Return copies of an entry by code, each with its mark where there are several codes.
+    """Return copies of an entry by code, each with its mark if there are several codes.
 
-    Where all own seeds have one code and the published ones another, these are marked as published.
+    If all own seeds have one code and all published seeds another, the published copy is marked as published.
     """
     kinds = by_code(copies)
     if len(kinds) == 1:
@@ -150,7 +149,7 @@ def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
 
 
 def _as_published(entry: EntryResults) -> EntryResults:
-    """Return an entry under a name of its own, beside one's own runs of it."""
+    """Return a published entry with a name and a label that differ from own runs of that entry."""
     if entry.name.endswith(BESIDE):
         return entry
     return replace(entry, name=f"{entry.name}{BESIDE}", label=f"{entry.label} (published)")
@@ -164,14 +163,14 @@ def select(
     Parameters
     ----------
     names:
-        The entries (see `find`); all that are selected where empty. Entries that were read stand as they are.
+        The entries (see `find`); the whole selection if empty. Entries that were read before are taken unchanged.
     horizon:
         Environment steps: longer curves are cut to it, shorter entries left out. None cuts nothing.
 
     Returns
     -------
     tuple
-        The entries, in the order named; and one line for each that was left out and why.
+        The entries, in the order named; and one line with the reason for each entry that was left out.
     """
     named = {
         (copy.task_hash, copy.name): copy
@@ -203,7 +202,7 @@ def select(
 
 
 def _at_whole_epochs(entries: Sequence[EntryResults], horizon: int) -> tuple[list[EntryResults], list[str]]:
-    """Leave out the tasks of which a horizon is no whole number of epochs; an error where that leaves none."""
+    """Leave out tasks in which a horizon is no whole number of epochs; an error if none is left."""
     whole, lines = [], dict[str, str]()
     for entry in entries:
         steps = entry.steps_per_epoch
@@ -221,14 +220,14 @@ def _at_whole_epochs(entries: Sequence[EntryResults], horizon: int) -> tuple[lis
 
 
 def equally_long(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
-    """Leave out entries that would cut a picture: those shorter than half of the others, task by task.
+    """Leave out entries that would cut a picture: entries shorter than half of the others, task by task.
 
-    Where any entry of a task reaches the task's shortest horizon, those that do not are left out first.
+    If some entries reach the task's shortest horizon, all shorter entries are left out first.
 
     Returns
     -------
     tuple
-        The entries that stay, in their order; and one line for each that was left out.
+        The entries that stay, in their order; and one line for each entry that was left out.
     """
     enough: dict[str, int] = {}
     for task in {entry.task_hash for entry in entries}:
@@ -306,7 +305,7 @@ def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
 
 
 def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
-    """Return what is shown of an entry's copies: the better one; or both where the own one gets less far."""
+    """Return the copies of an entry to show: the better copy, or both if the own copy is shorter."""
     own, further = copies[0], best(copies)
     if own.source == "runs" and _weight(own)[0] < _weight(further)[0]:
         return [own, _as_published(further)]
@@ -314,17 +313,17 @@ def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
 
 
 def _weight(entry: EntryResults) -> tuple[int, int, int]:
-    """Return what makes one of two copies of an entry the better one: epochs, seeds, epochs beyond the horizon."""
+    """Return the sort key of copies of an entry: epochs within the horizon, seeds, all epochs."""
     epochs = int(entry.curves.shape[1])
     enough = min(entry.task_file.ranking.horizons) // entry.steps_per_epoch
     return min(epochs, enough), len(entry.seeds), epochs
 
 
 def _stores(selection: Selection, of_studies: bool = False) -> list[EntryStore]:
-    """Return the folders of the entries that boards rank: in the results folder, and published ones.
+    """Return the folders of the entries that boards rank, in the results folder and published.
 
-    Entries of studies are among them where `of_studies` asks for all, or if their task has no other published entries
-    and is selected by name or has entries in the results folder.
+    Entries of studies are among them if `of_studies` is true, or if their task has no other published entries and is
+    selected by name or has entries in the results folder.
     """
     runs = selection.runs
     if not runs.is_dir() and not selection.published:
@@ -374,14 +373,14 @@ def _of_code(store: EntryStore, group: codes.SameCode) -> EntryResults | None:
 
 
 def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryResults | None:
-    """Read one entry from its runs; None where no run has finished an epoch. Tuning seeds do not count.
+    """Read one entry from its runs; None if no run has finished an epoch. Tuning seeds do not count.
 
-    A seed of which a file is damaged, or which is not what its folder says, is left out alone.
+    A seed with a damaged file, or in the wrong folder, is left out; other seeds are read.
 
     Parameters
     ----------
     seeds:
-        These alone; None for all.
+        The only seeds to read; None for all.
     """
     record = store.record()
     runs, refused = _readable(store, current(record), seeds)
@@ -445,7 +444,7 @@ def _readable(
 
 
 def _require_independent(store: EntryStore, runs: Sequence[SeedRun]) -> set[str]:
-    """Return what probes of an entry's runs have found (`qrlsuite.results.probes`)."""
+    """Return the results of probes of an entry's runs (`qrlsuite.results.probes`); dependent seeds are an error."""
     made = [probe for run in runs if (probe := probes.of_record(run.record)) is not None]
     for probe in made:
         if probe["result"] == probes.DIFFERS:

@@ -1,4 +1,4 @@
-"""An entry with its learning curves: what boards, pictures and comparisons are made of."""
+"""An entry with its learning curves, for boards, pictures and comparisons."""
 
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ class EntryResults(Shown):
     Attributes
     ----------
     parameters:
-        Trainable numbers of one agent: classical, and of circuits.
+        Trainable numbers of one agent: classical, quantum.
     fixed:
         Numbers of one agent that stay as drawn.
     networks:
-        The networks that `parameters` are summed over, all that are trained. None in records of older versions, which
-        counted the first alone, see `first_network_alone`.
+        Number of trained networks, over which `parameters` are summed. None in records of older versions, which counted
+        the first network alone, see `first_network_alone`.
     curves:
-        (N, T) float64: mean validation score per run and epoch. T is what half of the finished runs or more have.
+        (N, T) float64: mean validation score per run and epoch. Half of the finished runs or more have T epochs.
     seeds:
         The N seeds.
     left_out:
         Seeds whose runs have fewer than T epochs yet.
     runs:
-        Every run's own curve by seed, shorter ones and longer ones; empty where all have T epochs.
+        Every run's whole curve by seed, shorter or longer than T; empty if all have T epochs.
     hours:
-        Core-hours spent on the runs, those that were left out too.
+        Core-hours spent on all runs, with the left-out ones.
     clocked:
-        Whether any of these hours are by the clock and not processor time; None where the record does not say.
+        Whether some of these hours are by the clock and not processor time; None if not recorded.
     codes:
-        Digests of the code identities of its seeds; none where all code is the suite's with its first bits, or unknown.
+        Digests of the code identities of its seeds; empty if all code is the suite's first version, or unknown.
     environments:
-        Digests of the environment's code, of every one that occurs among its seeds; none where it is the suite's.
+        Digests of every code of the environment among its seeds; empty if the environment is the suite's.
     plugins:
-        Of the plugins by path among that code, by file name: which contents trained its seeds.
+        Contents of plugins by path that trained its seeds, by file name.
     identity:
-        What the entry's hash covers: task, algorithm, model and their resolved options.
+        Content of the entry's hash: task, algorithm, model and their resolved options.
     options:
         The resolved options under "algorithm", "model" and "environment".
     preset:
@@ -69,33 +69,32 @@ class EntryResults(Shown):
     commits, processors, devices:
         Every code revision, processor and kind of device that occurs among the seeds.
     executions:
-        Circuit executions of these runs in all.
+        Circuit executions of all these runs.
     tuning:
-        How the settings were found, where their preset says so, see `qrlsuite.experiment.preset.EntryTuning`.
+        How the settings were found, if their preset says so, see `qrlsuite.experiment.preset.EntryTuning`.
     plan:
-        Hash of the study with looks that trained it; None for a number of seeds that was fixed in advance.
+        Hash of the study with looks that trained it; None if the number of seeds was fixed in advance.
     source:
         Whether the curves were read from a results folder or from a published entry.
     external:
         Whether another program made the curves: nobody here trained them, or can check them.
     agents:
-        The seeds whose trained agents are published with it; none of an entry from a results folder.
+        The seeds whose trained agents are published with it; empty for an entry from a results folder.
     color:
-        Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
+        Number of its color and pattern in pictures, which stays if others are left out; None takes the next number.
     unprobed:
-        Whether code of others has part in it and no probe has shown that its seeds are independent.
+        Whether it has code of others and no probe has shown that its seeds are independent.
     chosen_seeds:
-        Why no board ranks it, of a published entry whose seeds may have been chosen; empty otherwise.
+        Why no board ranks it, if it is published and its seeds may have been chosen; empty otherwise.
     first_thresholds:
-        The thresholds in force when its first seed was trained; None where the record does not say.
+        The thresholds in force when its first seed was trained; None if not recorded.
     records:
-        By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
-        `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
+        Facts by seed, with left-out seeds: `epochs`, `finished`, core-`hours`, circuit `executions`, and `diverged`, the
+        first epoch after which its agent's numbers were not finite.
     refused:
-        One line for each seed that does not count, because a file of it is damaged or it is not what it says.
+        One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
     measured:
-        By seed and name, what the environment measured of each epoch's validation, see
-        `qrlsuite.results.store.SeedRun.measured`.
+        Metrics of the environment by seed and name, see `qrlsuite.results.store.SeedRun.measured`.
     """
 
     name: str
@@ -156,15 +155,15 @@ class EntryResults(Shown):
         Parameters
         ----------
         curves:
-            Each seed's curve (T,), of any lengths.
+            Each seed's curve (T,); lengths may differ.
         parameters:
             The result of `qrlsuite.results.store.parameters_of`.
         made_with:
-            What made the seeds, see `qrlsuite.results.provenance.collect`.
+            Provenance of the seeds, see `qrlsuite.results.provenance.collect`.
         probed:
             The results of probes of its seeds.
         records, facts:
-            Attributes that stay as they are.
+            Further attributes, unchanged.
         """
         identity, now = record.identity, current(record)
         length = _common_length(records.values())
@@ -209,7 +208,7 @@ class EntryResults(Shown):
         )
 
     def marked(self, mark: str) -> EntryResults:
-        """Return the entry with a mark behind its name and its label, which say of which code it is."""
+        """Return the entry with the mark of its code behind its name and its label."""
         if not mark or "@" in self.name:
             return self
         return replace(self, name=f"{self.name}{mark}", label=f"{self.label} {mark}")
@@ -226,19 +225,19 @@ class EntryResults(Shown):
 
     @property
     def metrics(self) -> dict[str, NDArray[np.float64]]:
-        """By name, what the environment measured along the curves, (N, T) each; NaN where it did not."""
+        """Metrics of the environment along the curves by name, (N, T) each; NaN where it measured none."""
         held = [self.measured.get(seed, {}) for seed in self.seeds]
         length, nothing = self.curves.shape[1], np.full(self.curves.shape[1], np.nan)
         names = sorted({name for own in held for name in own})
         return {name: np.stack([own.get(name, nothing)[:length] for own in held]) for name in names}
 
     def cut(self, epochs: int) -> EntryResults | None:
-        """Return the first epochs of every run that has reached a number of them; None for none."""
+        """Return the first epochs of every run that has reached them; None if no run has."""
         reached = self.reaching(epochs)
         return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
 
     def with_seeds(self, seeds: int | str | Iterable[int]) -> EntryResults:
-        """Return the entry with these seeds only, to see what fewer seeds would have said.
+        """Return the entry with these seeds only, to see the results of fewer seeds.
 
         Parameters
         ----------
@@ -264,7 +263,7 @@ class EntryResults(Shown):
 
     @property
     def changed_thresholds(self) -> bool:
-        """Whether it is judged by other thresholds than those in force when its first seed was trained."""
+        """Whether the thresholds have changed since its first seed was trained."""
         first = self.first_thresholds
         return first is not None and sorted(first) != sorted(self.task_file.ranking.grid.thresholds)
 
@@ -296,7 +295,7 @@ class EntryResults(Shown):
 
     @property
     def facts(self) -> dict[str, str]:
-        """What a person asks of an entry first, in words."""
+        """The first facts about an entry, in words."""
         n_runs, epochs = self.curves.shape
         return {
             "task": self.task,
@@ -320,12 +319,12 @@ class EntryResults(Shown):
         return table
 
     def parameters_text(self, unit: str = "") -> str:
-        """Write the numbers of parameters, `73 + 240` with those of circuits second; `-` where they are not known.
+        """Write the numbers of parameters, classical and quantum: `73 + 240`; `-` if unknown.
 
         Parameters
         ----------
         unit:
-            What follows those of circuits.
+            Text behind the quantum number.
         """
         classical, quantum = self.parameters
         if self.external and not classical + quantum:
@@ -334,7 +333,7 @@ class EntryResults(Shown):
 
     @property
     def fixed_text(self) -> str:
-        """What follows the trainable numbers where others stay as drawn: ` (240 fixed)`."""
+        """A note on numbers that stay as drawn: ` (240 fixed)`; empty if there are none."""
         return f" ({self.fixed} fixed)" if self.fixed else ""
 
     @property
@@ -359,7 +358,7 @@ class EntryResults(Shown):
 
     @property
     def mixed_versions(self) -> tuple[str, ...]:
-        """The distributions of which more than one version made the runs."""
+        """The distributions whose versions differ between the runs."""
         return tuple(name for name, used in self.versions.items() if len(used) > 1)
 
     @property
@@ -381,7 +380,7 @@ class EntryResults(Shown):
 
     @property
     def settings(self) -> str:
-        """Where its settings come from: the preset and what `--set` changed of it, or `tuned` and how much."""
+        """Source of its settings: the preset and its options changed by `--set`, or `tuned` and the budget."""
         if self.tuning is not None:
             return _tuned_text(self.tuning)
         if self.external:
@@ -401,7 +400,7 @@ class EntryResults(Shown):
 
     @property
     def on_protocol_seeds(self) -> bool:
-        """Whether its settings are known to have been chosen on seeds that it is judged by."""
+        """Whether its settings are known to have been chosen on the seeds that judge it."""
         return bool(self.tuning and self.tuning.get("on_protocol_seeds"))
 
     @property
@@ -411,9 +410,9 @@ class EntryResults(Shown):
 
 
 def current(record: EntryRecord) -> TaskFile:
-    """Return the file of an entry's task as it is registered now, where the entry has the same definition of it.
+    """Return the task's registered file if the entry has that definition, else the entry's own file.
 
-    Ranking is no part of a definition: without this the cells of a board would be those of whichever entry comes first.
+    Ranking is no part of a definition: with the entries' own files, the first entry of a board would choose its cells.
     """
     registered = registered_task(record.task_name)
     same = registered is not None and registered.hash == record.task_hash
@@ -421,7 +420,7 @@ def current(record: EntryRecord) -> TaskFile:
 
 
 def edited_between(first: EntryResults, second: EntryResults) -> str:
-    """Say that two entries of a task saw environments of other code, whose scores mean other things; empty if not."""
+    """Return the error text if two entries of a task saw environments of different code; empty if not."""
     if not first.environments or not second.environments or first.environments & second.environments:
         return ""
     return (
@@ -468,7 +467,7 @@ _TOLERANCE = 1e-6  # a mean of scores in [0, 1] may leave it by rounding
 
 
 def _tuned_text(tuning: Mapping[str, Any]) -> str:
-    """Say how much was tuned, as far as it is known: `tuned (24 trials, 32 seeds, regret 5%)`."""
+    """Return the budget of tuning as far as it is known: `tuned (24 trials, 32 seeds, regret 5%)`."""
     known = [counted(int(tuning["trials"]), "trial")] if tuning.get("trials") is not None else []
     if isinstance(tuning.get("seeds"), str):
         with contextlib.suppress(OptionError):  # text of another suite, which a record may hold

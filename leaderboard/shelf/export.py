@@ -23,9 +23,9 @@ from qrlsuite.results.store import Arrays, EntryStore, SeedRun, parameters_of
 def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = True) -> Path:
     """Write an entry's published form; returns its folder `out/<task>/<entry>`.
 
-    Only complete runs are written. Where the entry was published without agents and has these seeds' curves, bit for
-    bit, only the agents are added, with what they were made with. What the seeds looked like before training is
-    computed anew, so that a file that was changed since does not agree with it.
+    Only complete runs are written. If the entry was published without agents and has these seeds' curves, bit for bit,
+    only the agents are added, with their provenance. The fingerprint of untrained seeds is computed anew, so that a
+    file that was changed meanwhile does not agree with it.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     force:
         Replace a published entry that has more seeds or more epochs.
     agents:
-        Write the trained agents, too: of all seeds whose parameters are there, finite, and of the last epoch of the
-        curves.
+        Write the trained agents, too, of all seeds whose parameters exist, are finite and belong to the curves' last
+        epoch.
     """
     if entry.source != "runs":
         raise QrlSuiteError(f"{entry.folder} is a published entry already")
@@ -98,7 +98,7 @@ def _agents(store: EntryStore, entry: EntryResults) -> dict[int, Arrays]:
 
 
 def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Mapping[int, Arrays]) -> bool:
-    """Add agents to an entry that was published without; returns whether its curves are those of the agents' runs."""
+    """Add agents to an entry published without agents, if its curves are those of the agents' runs; return whether."""
     if not folder.exists():
         return False
     there = published.read(folder)
@@ -128,9 +128,9 @@ def _found(runs: Sequence[SeedRun]) -> dict[str, Any]:
 
 
 def _made_with(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what a seed's last epochs were made with; under `before`, what else earlier ones were made with.
+    """Return the provenance of a seed's last epochs; under `before`, different provenances of earlier epochs.
 
-    The `host`, which a remote worker's record has, is nobody else's business.
+    The `host` in a remote worker's record is private.
     """
     *earlier, last = [{name: part for name, part in record.items() if name != "host"} for record in records]
     before = [record for record in dict.fromkeys(map(_frozen, earlier)) if record != _frozen(last)]
@@ -160,7 +160,7 @@ def _refuse_smaller(folder: Path, entry: EntryResults, force: bool) -> None:
 
 
 def _replace(folder: Path, content: dict[str, bytes]) -> None:
-    """Put whole files in place of a folder: a reader sees the old ones or the new ones."""
+    """Replace a folder's files as a whole: a reader sees the old files or the new files."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:

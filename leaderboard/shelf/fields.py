@@ -1,8 +1,7 @@
 """Results as tables: a row for each entry, each seed or each epoch, with every option as a column.
 
-Columns of options come from the entries' own records: `model.width`, `algorithm.lr`, `environment.degree`. Nobody lists
-them, so those of a plugin are there as those of the suite are. They cannot collide with the other columns, which have
-no dot in their names.
+Columns of options come from the entries' own records: `model.width`, `algorithm.lr`, `environment.degree`. So options
+of plugins have columns, too. They cannot collide with other columns, whose names have no dot.
 """
 
 from __future__ import annotations
@@ -26,24 +25,24 @@ from qrlsuite.statistics import areas, final_scores, last_epochs
 from qrlsuite.statistics.times import times_below, times_lost
 
 Rows = Literal["entries", "seeds", "epochs"]
-"""What a row of a table is."""
+"""Kinds of rows of a table."""
 
 SIDES = ("model", "algorithm", "environment")
-"""What has options; their columns are called `SIDE.NAME`."""
+"""Parts of an entry with options; columns of options are called `SIDE.NAME`."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """A column that every table of some rows has.
+    """A column that every table of a kind of rows has.
 
     Attributes
     ----------
     type:
-        Of Arrow.
+        Type in Arrow.
     meaning:
-        What it is, for those who read tables.
+        Explanation for readers of tables.
     unit:
-        What its numbers count; empty for names, counts of what the name says, and scores.
+        Unit of its numbers; empty for names, scores, and counts whose name is the unit.
     """
 
     name: str
@@ -108,7 +107,7 @@ FIELDS: dict[Rows, tuple[Field, ...]] = {
         Field("score", _REAL, "mean score of the validation after it"),
     ),
 }
-"""Columns by what a row is; options follow them."""
+"""Columns by the kind of rows; columns of options follow them."""
 
 
 def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
@@ -117,14 +116,14 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     Parameters
     ----------
     rows:
-        What a row is.
+        The kind of rows.
 
     Returns
     -------
     pyarrow.Table
-        With the columns of `FIELDS[rows]`, and one for each option that an entry has and for each metric of its
-        environment (`measured.NAME`, like the score of the row), null where another has it not.
-        A column of whole and other numbers has float64, one of numbers and texts has texts; lists are JSON.
+        The columns are `FIELDS[rows]`, each option of an entry, and each metric of an environment (`measured.NAME`,
+        averaged like the row's score); null if an entry has it not. A column of whole and other numbers is float64, a
+        column of numbers and texts is text; lists are JSON.
     """
     make: dict[Rows, Callable[[EntryResults], dict[str, Sequence[Any] | NDArray[Any]]]] = {
         "entries": _of_entry,
@@ -158,7 +157,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
 
 
 def _metric(entry: EntryResults, name: str, rows: Rows) -> pyarrow.Array:
-    """Return a metric of an entry: of every epoch, of every seed by its last tenth, or the mean of these."""
+    """Return a metric of an entry: of every epoch, of every seed over its last tenth, or the mean over seeds."""
     values = entry.metrics.get(name, np.full(entry.curves.shape, np.nan))
     if rows == "epochs":
         return pyarrow.array(values.ravel(), _REAL, from_pandas=True)
@@ -168,7 +167,7 @@ def _metric(entry: EntryResults, name: str, rows: Rows) -> pyarrow.Array:
 
 
 def facts(entry: EntryResults) -> dict[str, Any]:
-    """Return the one row of an entry, as plain values."""
+    """Return an entry's row as plain values."""
     [row] = table([entry], "entries").to_pylist()
     return dict(row)
 
@@ -267,7 +266,7 @@ def _cost(entry: EntryResults, value: Any) -> Any:
 
 
 def _of_seeds(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
-    """Return the complete seeds, and those left out, which have no scores."""
+    """Return the complete seeds, and the left-out seeds without scores."""
     seeds = [*entry.seeds, *entry.left_out]
     records = [entry.records.get(seed, {}) for seed in seeds]
     lacking = [None] * len(entry.left_out)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from qrlsuite.experiment.entry import Entry
 
 CHUNK = 25
-"""Seeds at a time: memory stays that of a small group."""
+"""Seeds at a time, to bound memory."""
 
 Floats = NDArray[np.float64]
 

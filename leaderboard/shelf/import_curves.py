@@ -1,11 +1,11 @@
-"""Importing learning curves that other programs made, as entries to compare: they are *external*.
+"""Imports learning curves of other programs as *external* entries.
 
 An external entry has curves alone: nobody here can train it again, evaluate its agents, or check that its seeds are
-what they are called. Its algorithm is called `external`, so that its label says so wherever it stands, and `imported`
-in its `entry.json` says from what it was made.
+genuine. Its algorithm is called `external`, so every label shows it, and `imported` in its `entry.json` names the
+source.
 
-Curves are brought to a grid of equal steps: the score at a grid point is the last one that was observed at or before
-it. Nothing is interpolated, nothing is carried backward, and no curve goes on beyond its last observation.
+Curves are brought to a grid of equal steps: the score at a grid point is the last observation at or before it. Nothing
+is interpolated, nothing is carried backward, and no curve goes on beyond its last observation.
 """
 
 from __future__ import annotations
@@ -75,22 +75,22 @@ def import_points(
     points:
         Steps and scores of each run.
     task:
-        A task of the suite or of the results folder, which says the grid and the thresholds; or a new name.
+        A task of the suite or of the results folder, which fixes the grid and the thresholds; or a new name.
     maximum:
         The best possible score: scores become fractions of it.
     thresholds:
-        Scores that count as reached, of a new task; by default .6, .7, .8 and .9 of the maximum.
+        Thresholds of a new task; by default .6, .7, .8 and .9 of the maximum.
     every:
         Environment steps between two grid points of a new task.
     goal:
-        `below` where less is better, of a new task with thresholds; None is `above`.
+        `below` if less is better, for a new task with thresholds; None is `above`.
     metric:
-        What the score is called where less is better.
+        Name of the score if less is better.
 
     Returns
     -------
     list
-        What was imported of each entry.
+        The imported seeds of each entry.
     """
     given = _require_options(maximum, thresholds, every, goal)
     name = task or EXTERNAL
@@ -225,9 +225,9 @@ def _require_reachable(
 
 
 def _cut(curves: Mapping[Run, NDArray[np.float64]]) -> dict[Run, NDArray[np.float64]]:
-    """Cut the curves of each entry to the shortest, but for those that end long before the longest.
+    """Cut the curves of each entry to the shortest, without curves that end long before the longest.
 
-    Runs that end with an episode end a little apart, and none of them should be left out for that.
+    Runs that end with an episode differ a little in length, and none should be left out for that.
     """
     ends: dict[str, list[int]] = defaultdict(list)
     for (entry, _), curve in curves.items():
@@ -291,7 +291,7 @@ def _new_task(
 
 
 def _definition(file: TaskFile) -> dict[str, Any]:
-    """Return what the hash of a new task covers."""
+    """Return the content of a new task's hash."""
     return {
         "environment": file.environment.name,
         "environment_options": {},
@@ -354,9 +354,9 @@ def _require_no_copies(
     scores: Mapping[int, NDArray[np.float64]],
     store: EntryStore,
 ) -> None:
-    """Refuse two seeds of one curve, but for curves of one or two values, which runs that learn nothing share.
+    """Refuse two seeds with one curve. Curves of one or two values are allowed: runs that learn nothing share them.
 
-    Those that were imported before count, too; they are known as scores, in the unit of the task.
+    Curves that were imported before count, too; they are stored as scores, in the unit of the task.
     """
     before: dict[bytes, int] = {}
     for seed in store.seeds() if store.path.is_dir() else []:
@@ -377,7 +377,7 @@ def _require_no_copies(
 def _record(
     entry: str, task: str, file: TaskFile, definition: Mapping[str, Any], told: Mapping[str, Any]
 ) -> EntryRecord:
-    """Return what `entry.json` says of an entry."""
+    """Return the `entry.json` of an entry."""
     words = _notation_of(entry)
     identity = {
         "task": dict(definition),
@@ -501,7 +501,7 @@ def _notes(
     seeds: Sequence[int],
     every: int,
 ) -> list[str]:
-    """Say what a reader has to know: too few seeds, and runs that end before the others."""
+    """Return notes for the reader: too few seeds, and runs that end before the others."""
     notes = []
     ends = [last // every for last in lasts]
     if max(ends) > max(map(len, curves.values())):
@@ -521,7 +521,7 @@ def _notes(
 
 
 def told(done: Sequence[Imported]) -> list[str]:
-    """Say on which grid and by which thresholds imported entries stand."""
+    """Return the grid and the thresholds of imported entries, in words."""
     record = done[0].store.record()
     file, best = record.task_file, record.maximum
     grid = "" if record.imported is None else record.imported.grid

@@ -1,8 +1,8 @@
-"""Importing seeds that were trained elsewhere: of an exported entry, or of another results folder.
+"""Imports seeds that were trained elsewhere, from an exported entry or another results folder.
 
-They count as seeds that were trained here, and `qrlsuite run` trains only what is missing. Each seed's folder is copied
-beside its place and renamed into it, so that it is there whole or not at all, and an import that was stopped goes on
-when it is repeated. Seeds that are here already stay as they are.
+They count as seeds that were trained here, and `qrlsuite run` trains only the missing ones. Each seed's folder is
+copied beside its place and renamed into it, so that no half copy counts, and a repeated import continues a stopped
+one. Existing seeds stay unchanged.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ from qrlsuite.results.store import (
 
 @dataclass(frozen=True)
 class Imported:
-    """What was imported of an entry.
+    """The imported seeds of an entry.
 
     Attributes
     ----------
     store:
         The entry's folder here.
     name, label, task:
-        What the entry and its task are called.
+        Names of the entry and its task.
     new, known:
-        Seeds that were copied, and seeds that were here already.
+        Copied seeds, and seeds that existed already.
     notes:
-        What a reader has to know: seeds that were left, and why; other versions.
+        Notes for the reader: seeds that were not imported, with reasons; other versions.
     """
 
     store: EntryStore
@@ -82,7 +82,7 @@ class Imported:
 
 
 def sources(folder: Path) -> list[EntryStore]:
-    """Return the entries of a folder: itself, or all below it, where it is a results folder or one of exports."""
+    """Return the entries of a folder: the folder itself, or all entries below a folder of results or exports."""
     if (folder / "entry.json").is_file():
         return [EntryStore(folder.resolve())]
     stores = entries(folder) if folder.is_dir() else []
@@ -138,7 +138,7 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
 
 
 def _place_for(store: EntryStore, source: EntryStore, exported: bool, runs: Path, entry: Entry) -> str:
-    """Return the mark of the seeds' folder: empty beside seeds of the same code, else their own mark."""
+    """Return the mark of the seeds' folder: empty if seeds of their code are there, else their own mark."""
     try:
         codes.require_mergeable(store, source, exported)
     except codes.ChangedCodeError:
@@ -268,7 +268,7 @@ def _from_export(
 
 
 def unplaced(store: EntryStore, seed: int) -> SeedStore:
-    """Return an empty place beside that of a seed, without what an import that was killed left there."""
+    """Return an empty folder beside a seed's folder; remains of a killed import are removed."""
     path = store.path / f".seed-{seed:04d}.import"
     shutil.rmtree(path, ignore_errors=True)
     return SeedStore(path, seed)
@@ -301,7 +301,7 @@ def differs(store: EntryStore, seed: int, curve: NDArray[np.float64]) -> bool:
 
 
 def differences(seeds: Sequence[int]) -> list[str]:
-    """Say of which seeds other curves are here."""
+    """Name the seeds whose curves here differ from the imported ones."""
     if not seeds:
         return []
     return [
@@ -311,7 +311,7 @@ def differences(seeds: Sequence[int]) -> list[str]:
 
 
 def _other_versions(made_with: Sequence[Any], entry: Entry) -> list[str]:
-    """Say which versions the seeds were made with, where they are not those that are installed here."""
+    """Name the versions that made the seeds, if they differ from the installed ones."""
     here = provenance.collect(entry.distributions())["versions"]
     versions_there = provenance.versions(list(made_with))
     relevant = {"qrlsuite", "torch", "numpy", "numba", *entry.distributions()}

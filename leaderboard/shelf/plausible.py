@@ -1,11 +1,10 @@
-"""What training seeds again says about published curves: how many seeds it takes, and which forgeries it finds.
+"""Checks of published curves by training seeds again: the number of seeds needed, and tests against forgeries.
 
-Where bits are comparable, one seed that differs is proof. Elsewhere floating point differs in the last bits, and
-training amplifies that: most seeds keep their bits for some epochs, then part. Two statements can be tested there
-without a tolerance. A seed's first epochs are its own: hardly any other seed's published curve is nearer. And the
-number that ranks, the steps that a run spends below the thresholds, has the same law in both trainings; pairs of
-the same seed are compared, and all seeds that were trained again with all that were not. `benchmarks/forgeries.py`
-computes what these find.
+If bits are comparable, one seed that differs is proof. Otherwise floating point differs in the last bits, and training
+amplifies that: most seeds keep their bits for some epochs, then part. Two tests need no tolerance. A seed's first
+epochs are its own: hardly any other seed's published curve is nearer. And the number that ranks, the steps that a run
+spends below the thresholds, has one law in both trainings: pairs of one seed are compared, and all retrained seeds with
+all others. `benchmarks/forgeries.py` computes the power of these tests.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ Floats = NDArray[np.float64]
 
 
 def found_by(again: int, forged: int, seeds: int) -> float:
-    """Return the probability that at least one of `forged` of all seeds is among those that are trained again.
+    """Return the probability that at least one of `forged` seeds is among the `again` seeds that are trained again.
 
     >>> round(found_by(25, 10, 100), 3)
     0.952
@@ -138,10 +137,10 @@ def faster(curves: Floats, factor: float = FASTER) -> Floats:
 
 
 def power(curves: Floats, again: Floats, places: list[int], run_times: Callable[[Floats], Floats]) -> float:
-    """Return how often curves that are 10 percent faster than these would be called implausible by their times.
+    """Return how often the test of times would reject curves that are 10 percent faster than these.
 
-    Pairs of the seeds that were trained again are drawn anew, so that the result holds for this entry, with what
-    its seeds have in common in two trainings. A faster curve keeps its first epochs: those who forge know this check.
+    Pairs of the retrained seeds are drawn anew, so that the result holds for this entry and the correlation of its
+    two trainings. A faster curve keeps its first epochs: a forger knows that check.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Published entries: an entry's validation curves and how they were made, in three small files, and its agents.
+"""Published entries: validation curves and their provenance in three small files, and trained agents.
 
-    <task>/<entry>/entry.json       what was run, with every option, versions and processors
-                   curves.parquet   seed, epoch, score: the mean of each validation, and what else was measured
-                   seeds.parquet    per seed: hours, circuit executions, and what it looked like before training
-                   agents.safetensors  the trained parameters of all or some seeds, seed-first; need not be there
+    <task>/<entry>/entry.json       every option, versions and processors
+                   curves.parquet   seed, epoch, score (the mean of each validation), and other metrics
+                   seeds.parquet    per seed: hours, circuit executions, and a fingerprint from before training
+                   agents.safetensors  the trained parameters of all or some seeds, seed-first; optional
 
 Nothing in them is believed: hashes are computed again, the folder's place, the label and every number are
 checked, and every figure of a leaderboard is computed from the curves.
@@ -51,16 +51,17 @@ PUBLISHED = Path(__file__).parents[1] / "entries"
 """The entries that come with the suite and stand on its boards."""
 
 OF_STUDIES = Path(__file__).parents[1] / "unranked"
-"""The entries of studies that come with the suite: more entries on a board make each of its pairs harder to decide.
+"""The entries of studies that come with the suite. Boards leave them out: every further entry makes pairs harder to
+decide.
 
-A study ranks its own. A task that has no others has a board of them.
+A study ranks its own entries. A task without other entries has a board of them.
 """
 
 CURVES = "curves.parquet"
 SEEDS = "seeds.parquet"
 AGENTS = "agents.safetensors"
 MAX_BYTES = 20_000_000
-"""A file larger than this, packed or unpacked, is no entry; nor one of more values than its seeds and epochs make."""
+"""A larger file, packed or unpacked, is refused, as is one with more values than its seeds and epochs make."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,11 @@ class PublishedEntry:
     hours, executions:
         (N,): core-hours and circuit executions per seed.
     measured:
-        By name, what the environment measured of each validation (N, T); NaN where it did not.
+        Metrics of the environment by name, (N, T); NaN where it measured none.
     origins:
-        (N,): for each seed the index of its provenance in the record.
+        (N,): index of each seed's provenance in the record.
     fingerprint:
-        What the seeds looked like before training.
+        Fingerprint of the seeds from before training.
     """
 
     folder: Path
@@ -104,7 +105,7 @@ class PublishedEntry:
 
     @property
     def provenance(self) -> list[Mapping[str, Any]]:
-        """What each seed was made with, in the seeds' order."""
+        """The provenance of each seed, in the seeds' order."""
         return [self.published.provenance[index] for index in self.origins]
 
     @property
@@ -142,7 +143,7 @@ class PublishedEntry:
         return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
 
     def entry_results(self) -> EntryResults:
-        """Return what a leaderboard ranks."""
+        """Return the entry as a leaderboard ranks it."""
         made_by, diverged = [self.record.code_identity], self.published.diverged
         return EntryResults.of_record(
             self.record,
@@ -172,19 +173,19 @@ class PublishedEntry:
         )
 
     def metrics(self, row: int) -> dict[str, NDArray[np.float64]]:
-        """Return what the environment measured of one seed, (T,) by name."""
+        """Return the metrics of one seed's environment, (T,) by name."""
         return {name: values[row] for name, values in self.measured.items()}
 
 
 class PublishedAgents(EntryStore):
-    """The seeds of a published entry that have agents, read as those of a results folder are.
+    """The seeds of a published entry that have agents, read like seeds of a results folder.
 
     Parameters
     ----------
     folder:
-        The published entry's.
+        Folder of the published entry.
     runs:
-        A results folder: evaluations are kept there, for nothing is written beside published files.
+        A results folder for evaluations: nothing is written beside published files.
     """
 
     def __init__(self, folder: Path, runs: Path) -> None:
@@ -217,14 +218,14 @@ class PublishedAgents(EntryStore):
 
 
 class _PublishedSeed(SeedStore):
-    """One of the agents: what of its run is published."""
+    """One published seed: its record, curve and parameters."""
 
     def __init__(self, of: PublishedAgents, seed: int) -> None:
         super().__init__(of.path, seed, of)
         self._published, self.agent = of, of.path / AGENTS
 
     def record(self) -> dict[str, Any]:
-        """Return what `run.json` has of a seed's end and code."""
+        """Return the end and the code of a seed, as in `run.json`."""
         entry = self._published.published
         code = {} if entry.record.code is None else {"code": entry.record.code.content}
         return {**code, "status": "finished", "epochs": int(entry.curves.shape[1])}
@@ -248,7 +249,7 @@ def folders() -> tuple[Path, ...]:
 
 
 def comes_with_suite(folder: Path) -> bool:
-    """Return whether a folder is that of an entry that comes with the suite."""
+    """Return whether a folder holds an entry that comes with the suite."""
     return folder.parent.parent in folders()
 
 
@@ -263,9 +264,8 @@ def read(folder: Path, label: bool = True) -> PublishedEntry:
     Parameters
     ----------
     label:
-        Check the label, for which the algorithm's and the model's code are imported, and torch with them. Boards leave
-        it out for entries that come with the suite: this file comes from the same place, and `verify` and the tests
-        check them in full.
+        Check the label, which imports the code of algorithm and model, and torch. Boards do without for entries that
+        come with the suite: this file comes from the same place, and `verify` and the tests check them in full.
     """
     try:
         return _read(folder, label)
@@ -363,7 +363,7 @@ def _require(holds: bool, folder: Path, problem: str) -> None:
 
 
 def _check_identity(folder: Path, record: EntryRecord) -> None:
-    """Check that place and protocol are those of what the hashes stand for."""
+    """Check that the hashes belong to the folder's place and the protocol."""
     for name in (record.identity.algorithm, record.identity.model):
         _require(bool(NAME.fullmatch(name)), folder, f"{name!r} is not a name")
     _require(
@@ -408,7 +408,7 @@ def _check_label(folder: Path, record: EntryRecord) -> None:
 
 
 def _words(label: str) -> list[tuple[str, str]]:
-    """Return the options that a label writes; before 0.2.0 it wrote those of an ansatz as a table."""
+    """Return the options in a label; before 0.2.0 an ansatz's options were a table there."""
     written = parse_entry(label)
     words = [("algorithm", str(written.algorithm)), ("model", written.model)]
     for setting in written.settings:
@@ -467,7 +467,7 @@ def _curves(
 
 
 def _refuse_copies(folder: Path, seeds: list[int], curves: NDArray[np.float64]) -> None:
-    """Refuse two seeds with one curve, but for curves of one or two values, which runs that learn nothing share."""
+    """Refuse two seeds with one curve. Curves of one or two values are allowed: runs that learn nothing share them."""
     first: dict[bytes, int] = {}
     for seed, curve in zip(seeds, curves):
         other = first.setdefault(curve.tobytes(), seed)
@@ -584,7 +584,7 @@ def encode_record(content: Mapping[str, Any]) -> bytes:
 
 
 def encode_agents(agents: Mapping[int, Arrays]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return what the record says of agents, and their file by name; of no agents nothing."""
+    """Return the record of agents, and their file by name; both empty without agents."""
     if not agents:
         return {}, {}
     seeds = sorted(agents)

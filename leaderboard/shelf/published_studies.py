@@ -1,8 +1,8 @@
 """Published studies with looks: the study, its log of looks, and the learning curves of its entries.
 
     <name>/plan.toml                the study as it was when its first seed began
-           looks.jsonl              when the first seed was begun and each look taken, and what it found
-           <task>/<entry>/...       as published entries, see `qrlsuite.leaderboard.shelf.published`
+           looks.jsonl              times of the first seed and of each look, and the look's results
+           <task>/<entry>/...       like published entries, see `qrlsuite.leaderboard.shelf.published`
 
 Verdicts are not stored: they are computed from the study and the curves.
 """
@@ -96,7 +96,7 @@ def is_published(path: Path) -> bool:
 
 
 def read(folder: Path, labels: bool = True) -> StudyOutcome:
-    """Return what a published study has decided; parameters as for `PublishedStudy`."""
+    """Return the outcome of a published study; parameters as for `PublishedStudy`."""
     if not is_published(folder):
         raise StoreError(
             f"{folder} holds no {FILE}: give a study's file, or a folder that `qrlsuite export` wrote"
@@ -106,9 +106,9 @@ def read(folder: Path, labels: bool = True) -> StudyOutcome:
 
 
 def collected(selection: Selection) -> tuple[list[StudyOutcome], list[str]]:
-    """Return what the studies with looks of some tasks have decided, and a line for each unreadable one.
+    """Return the outcomes of the selection's studies with looks, and a line for each unreadable study.
 
-    A study that the results folder and the suite have is read from the folder.
+    A study in both the results folder and the suite is read from the folder.
     """
     tasks = selection.tasks
     outcomes, refused = in_folder(selection.runs, tasks)
@@ -127,8 +127,8 @@ def collected(selection: Selection) -> tuple[list[StudyOutcome], list[str]]:
 def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
     """Write a study and its finished seeds to `out/<name>`; returns that folder.
 
-    Written again while the study goes on, it holds more seeds. Nothing there is replaced by less, and the study's own
-    file stays as it is: it may have been published before its first seed. `agents` writes the trained agents, too.
+    Exported again while the study goes on, it holds more seeds. No file is replaced by a smaller one, and the study's
+    own file stays unchanged: it may have been published before its first seed. `agents` writes the trained agents, too.
     """
     state = study.read()
     if not state.begun:

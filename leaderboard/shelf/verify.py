@@ -35,7 +35,7 @@ AGREEMENT = 1e-5
 EXECUTIONS = 0.1
 """By how much circuit executions of seeds whose curves differ may differ in sum: episodes have other lengths."""
 SAME = 1e-6
-"""Scores that differ by less are those of runs that have not parted yet."""
+"""Two runs have not parted while their scores differ by less."""
 
 Check = Literal["files", "verified", "plausible", "repeated"]
 Wanted = int | Literal["auto"]
@@ -43,21 +43,21 @@ Wanted = int | Literal["auto"]
 
 @dataclass(frozen=True)
 class VerificationResult:
-    """What came of checking one entry.
+    """The result of checking one entry.
 
     Attributes
     ----------
     check:
-        The strongest statement: of the files alone, of curves that came out bit for bit (`verified`), or of plausible
-        ones. Bits of seeds that were not drawn, but named by an earlier draw, are `repeated`.
+        The strongest statement: files alone, curves equal bit for bit (`verified`), or plausible curves. Equal bits of
+        seeds that an earlier draw named are `repeated`.
     seeds:
         The seeds that were trained again.
     message:
-        What was checked, what came out, and what was not compared, in words.
+        Checks, results, and omitted comparisons, in words.
     digest:
-        Of the entry's three files, 16 hexadecimal digits: checks of the same files belong together.
+        Hash of the entry's three files, 16 hexadecimal digits: it shows which checks are of equal files.
     choice:
-        The number that the seeds were drawn by; None where none were.
+        The number that drew the seeds; None if none were drawn.
     """
 
     folder: Path
@@ -96,10 +96,10 @@ class Retrained:
     agents:
         The trained parameters of each.
     parameters:
-        What may stand in the entry's record: numbers of all networks; and, where no number of networks stands in it, of
-        the first alone.
+        Parameters that the entry's record may state: of all networks; and of the first network alone, if the record
+        states no number of networks.
     measured:
-        By name, what the environment measured of each, (T,).
+        Metrics of each seed's environment by name, (T,).
     """
 
     curves: NDArray[np.float64]
@@ -135,17 +135,17 @@ def verify(
     """Check one published entry.
 
     With `rerun`, seeds are drawn and trained again from nothing, on the CPU. Initial parameters, the first epoch's
-    episodes and the score before training must agree to 1e-5, parameters and circuit executions must be those of the
-    record. Curves that the same versions made on the same type of machine must be equal, bit for bit. If others
-    differ, each must begin like the published one of its seed, and the steps below the thresholds must be plausible
+    episodes and the score before training must agree to 1e-5; numbers of parameters and circuit executions must equal
+    the record. If versions and type of machine are equal, curves must be equal, bit for bit. Otherwise a differing
+    curve must begin like its seed's published curve, and the steps below the thresholds must be plausible
     (`qrlsuite.leaderboard.shelf.plausible`).
 
     Parameters
     ----------
     rerun:
-        How many seeds; `auto` for as many as find a tenth of them forged with probability .95.
+        Number of seeds; `auto` for as many as find a tenth of forged seeds with probability .95.
     choice:
-        Of an earlier check, to train its seeds again. None draws a number that nobody who forges an entry can foresee.
+        The number of an earlier check, to train its seeds again. None draws a number that no forger can foresee.
     report:
         Called with the progress of the training.
     announce:
@@ -190,7 +190,7 @@ def _check_agents(entry: PublishedEntry) -> None:
 
 
 def _digest(folder: Path) -> str:
-    """Return a hash of an entry's files; that of its agents is in its record."""
+    """Return a hash of an entry's files; the record has the hash of the agents."""
     paths = (folder / name for name in ("entry.json", published.CURVES, published.SEEDS))
     hashes = b"".join(hashlib.sha256(path.read_bytes()).digest() for path in paths)
     return hashlib.sha256(hashes).hexdigest()[:16]
@@ -202,14 +202,14 @@ def _draw(number: int, digest: str, count: int, wanted: int) -> list[int]:
 
 
 def _cost(made_by: Entry, again: int, count: int, epochs: int) -> str:
-    """Say how many seeds are trained again, at which cost, and what that finds."""
+    """Return the number of seeds to train again, their cost, and the probability to find a forgery, in words."""
     known = speed.known(Path("runs")).estimate(made_by, min(again, CHUNK)).range(again * epochs)
     cost = "not known" if known is None else " to ".join(hours_text(seconds / 3600) for seconds in known)
     return f"{again} of {count} seeds are trained again, core-hours {cost}; {_finds(again, count)}"
 
 
 def _finds(again: int, count: int) -> str:
-    """Say which share of forged seeds this many find."""
+    """Return the probability that this many seeds find a forgery, in words."""
     forged = plausible.forged_of(count)
     return (
         f"if {forged} of {count} were forged, it would be found with probability "
@@ -220,7 +220,7 @@ def _finds(again: int, count: int) -> str:
 def _train_again(
     entry: PublishedEntry, made_by: Entry, places: list[int], report: Callable[[Progress], None]
 ) -> tuple[bool, Check, str]:
-    """Return whether what comes out fits the entry, the strongest statement, and both in words."""
+    """Return whether the retrained seeds fit the entry, the strongest statement, and both in words."""
     if problem := _beginning(entry, made_by, places):
         return False, "plausible", problem
     again = retrain(entry, places, report)
@@ -258,9 +258,9 @@ def _train_again(
 
 
 def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
-    """Say in what the installed code differs from that which made an entry; None where that is unknown or nothing.
+    """Name the differences between the installed code and the code that made an entry; None if unknown or none.
 
-    Other `numerics` are the same code with other bits, see `_elsewhere`.
+    Other `numerics` are equal code with other bits, see `_elsewhere`.
     """
     made_with = entry.record.code_identity
     if made_with is None:
@@ -275,7 +275,7 @@ def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
 
 
 def _beginning(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
-    """Say what differs before training, None where everything agrees."""
+    """Name the differences before training, None if everything agrees."""
     seeds = [entry.seeds[place] for place in places]
     here, stated = fingerprint(made_by, seeds), entry.fingerprint
     parts = {
@@ -299,7 +299,7 @@ def retrain(
     places: Sequence[int] | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Retrained:
-    """Train seeds of an entry from nothing, in memory: those at some places, or all."""
+    """Train the seeds at some places of an entry, or all seeds, from nothing and in memory."""
     made_by = entry.record.entry(str(entry.folder / "entry.json"))
     seeds = entry.seeds if places is None else [entry.seeds[place] for place in places]
     epochs = entry.curves.shape[1]
@@ -346,9 +346,9 @@ def _group(
 def _counts(
     entry: PublishedEntry, again: Retrained, places: Sequence[int], equal: NDArray[np.bool_]
 ) -> str | None:
-    """Say which of the numbers that come with an entry are not those of its re-run, None where all are.
+    """Name the numbers in an entry's record that differ from its re-run, None if all agree.
 
-    Circuit executions of seeds whose curves are equal are equal. Those of others depend on the lengths of episodes.
+    Seeds with equal curves have equal circuit executions. In other seeds they depend on the lengths of episodes.
     """
     stated = entry.published.parameters
     allowed = again.parameters if "networks" not in stated else again.parameters[:1]
@@ -378,11 +378,11 @@ def _same_parameters(stated: Mapping[str, int], counted: Mapping[str, int]) -> b
 
 
 def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
-    """Say in what this machine differs from the one that made the seeds; None where bits must be equal.
+    """Name a difference between this machine and the machine that made the seeds; None if bits must be equal.
 
-    The suite's version does not count: its parts compute equal bits while their `numerics` are equal, which are 1 where
-    none are recorded. Versions of plugins, and the device, are missing from what earlier versions of the suite
-    recorded: they are then not compared, and the device was the CPU.
+    The suite's version does not count: its parts compute equal bits while their `numerics` are equal (1 if not
+    recorded). Earlier versions of the suite recorded neither versions of plugins nor the device: these versions are
+    then not compared, and the device was the CPU.
     """
     here = provenance.of(made_by)
     for record in (made for place in places for made in provenance.records(entry.provenance[place])):
@@ -409,9 +409,9 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
 
 
 def _other_instructions(here: Mapping[str, Any], record: Mapping[str, Any]) -> str | None:
-    """Say in what the instruction sets differ: those of the processors, unless both sides fixed them alike.
+    """Name the difference between instruction sets of processors, unless both sides fixed them alike.
 
-    Records from before `instructions` hold none, and were made without.
+    Older records have no `instructions`; nothing fixed them then.
     """
     fixed, there = here["instructions"], record.get("instructions") or {}
     if fixed != there:
@@ -422,7 +422,7 @@ def _other_instructions(here: Mapping[str, Any], record: Mapping[str, Any]) -> s
 
 
 def _differs(entry: PublishedEntry, place: int, again: NDArray[np.float64]) -> str:
-    """Say where a curve leaves the published one."""
+    """Name the epoch at which a curve leaves the published curve."""
     stated = entry.curves[place]
     epoch = int(np.flatnonzero(again != stated)[0])
     return (
@@ -446,12 +446,12 @@ def _other_metric(entry: PublishedEntry, place: int, again: Mapping[str, NDArray
 
 
 def _equal(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
-    """Return whether two agents have the same parameters, bit for bit."""
+    """Return whether two agents have equal parameters, bit for bit."""
     return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
 def _plausible(entry: PublishedEntry, again: NDArray[np.float64], places: list[int]) -> tuple[bool, str]:
-    """Return whether curves of another machine may be those of the entry, and what says so, with its power."""
+    """Return whether curves of another machine may belong to the entry, and the tests with their power."""
     count, first = len(entry.seeds), plausible.FIRST
     unlike = plausible.strangers(again, entry.curves, places)
     made = (record for place in places for record in provenance.records(entry.provenance[place]))

@@ -75,7 +75,7 @@ class StudyRun(Shown):
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show the overview, where the pictures are, and what was handed to a queue."""
+        """Show the overview, the paths of pictures, and the seeds in a queue."""
         yield self.overview
         for line in (*(line for picture in self.pictures for line in picture.lines()), *self.submitted):
             yield Text(line)
@@ -161,17 +161,17 @@ def _plugins_of(study: StudyWithLooks, file: Path) -> str:
 def read_study(
     name: str, *more: str, runs: str | PathLike[str] = "runs", published: bool = False
 ) -> study_runner.Overview | StudyOutcome | StudiesTogether:
-    """Read how far a study is: what is trained and missing of it, or what its looks have decided. Trains nothing.
+    """Read a study's progress: its trained and missing seeds, or the decisions of its looks. Trains nothing.
 
     Parameters
     ----------
     name:
         A study (`qrlsuite list studies`), a study file's path, or a folder with a published study.
     more:
-        Further studies with looks, each of another task: then the pairs that all of them compare are read together, on
+        Further studies with looks, each of another task. The pairs that all studies compare are then read together, on
         average over the tasks.
     runs:
-        The results folder. A published study with looks that has not begun there is read as it was published.
+        The results folder. A study with looks that has not begun there is read in its published form.
     published:
         Count the published seeds and pairs of entries, too.
 
@@ -221,27 +221,27 @@ def run_study(
 ) -> StudyRun | StudyOutcome:
     """Train a study's missing seeds, the cheapest entry first, and draw its pictures.
 
-    Entries are those that `train` trains, in the same folders: nothing is trained twice. A study with looks has seeds
-    of its own, which are trained look by look, until every pair is decided or the last look was taken. Interrupt it at
-    any time: the same call continues, and ends with the same decisions.
+    Entries and their folders are those of `train`: nothing is trained twice. A study with looks has seeds of its own,
+    which are trained look by look, until every pair is decided or the last look was taken. Interrupt it at any time:
+    the same call continues, and ends with the same decisions.
 
     Parameters
     ----------
     name:
         A study (`qrlsuite list studies`), or a study file's path.
     options:
-        Options for every entry that has them, in the place of the study's own.
+        Options for every entry that has them; they replace the study's own.
     models:
-        Models in the place of others: `{"vqc-pennylane": "vqc-native"}`.
+        Models that replace others: `{"vqc-pennylane": "vqc-native"}`.
     only:
-        Only entries whose group, label or task has this word or one of these; or entries by name. Like `options`,
-        `models`, `seeds` and `epochs`, only of a study without looks.
+        Words that select entries by group, label or task; or names of entries. Like `options`, `models`, `seeds` and
+        `epochs`, only for a study without looks.
     seeds, epochs:
         As for `train`; None takes each task's protocol.
     budget:
         As for `train`, but stop at a group's end. The same call continues.
     format:
-        Of the pictures, which are written into the results folder.
+        Format of the pictures, which are written into the results folder.
     engine, workers, device, fresh, same, runs, progress:
         As for `train`.
 
@@ -296,9 +296,9 @@ def draw_study(
     name, options, models, only, format, runs:
         As for `run_study`.
     more:
-        Further studies with looks, each of another task: then the pairs that all of them compare are drawn together.
+        Further studies with looks, each of another task. The pairs that all studies compare are then drawn together.
     seeds:
-        Of every entry these alone; None takes all that are finished.
+        The seeds of every entry to draw; None takes all finished seeds.
     published:
         Draw the published entries, too.
 
@@ -336,14 +336,14 @@ def end_study(name: str, *, runs: str | PathLike[str] = "runs") -> None:
 
 @dataclass(frozen=True)
 class StudyWork:
-    """What is missing of a study, or of all that are registered.
+    """The missing seeds of a study, or of all registered studies.
 
     Attributes
     ----------
     chosen:
-        Studies with those of their entries that are wanted, the one that lacks least first.
+        Studies with their wanted entries; the study that lacks least comes first.
     left_out:
-        One line for each of all studies that has not what is wanted.
+        One line for each study without a wanted entry, if all studies are asked for.
     limit:
         Seconds for all of it; None for no limit.
     """
@@ -358,16 +358,16 @@ class StudyWork:
     limit: float | None
 
     def items(self, members: Sequence[Member] | None = None) -> list[PendingEntry]:
-        """Look at entries, each once; None takes those of every study."""
+        """Return the pending work of entries, each once; None takes the entries of every study."""
         every = [member for _, each in self.chosen for member in each] if members is None else members
         return study_runner.find_pending(every, self.runs, self.where, self.speeds, self.seeds, self.epochs)
 
     def steps(self) -> list[dict[str, Any]]:
-        """Return what would be trained, as plain values."""
+        """Return the planned training as plain values."""
         return study_runner.dry_run(self.items(), self.limit, self.where.workers)
 
     def train(self, format: str, progress: bool) -> Iterator[StudyRun]:
-        """Train study after study, and draw what is there of each; after Ctrl-C, too.
+        """Train study after study, and draw the finished seeds of each; after Ctrl-C, too.
 
         Raises
         ------
@@ -417,7 +417,7 @@ def find_work(
     where: Where,
     runs: str | PathLike[str],
 ) -> StudyWork:
-    """Find what of a study is missing, or of `all` that are registered; the arguments are those of `run_study`.
+    """Find the missing seeds of a study, or of `all` registered studies; the arguments are those of `run_study`.
 
     Raises
     ------
@@ -448,7 +448,7 @@ def find_work(
 def take_looks(
     study: Study, where: Where, budget: str | None, runs: str | PathLike[str], progress: bool
 ) -> StudyOutcome:
-    """Train a study with looks until all is decided, saying what every look decides."""
+    """Train a study with looks until all pairs are decided; print the decisions of every look."""
     subject = StudyWithLooks(study, Path(runs))
     limit, known = budgets.seconds(budget, where.workers), speed.known(subject.folder, Path(runs))
     session = study_runner.Session(subject.folder, where, known, limit, not progress)
@@ -456,7 +456,7 @@ def take_looks(
 
 
 def require_unchanged(name: str, given: Mapping[str, object]) -> None:
-    """Refuse arguments that would change what a study with looks has fixed."""
+    """Refuse arguments that would change a study with looks."""
     if words := [word for word, value in given.items() if value]:
         raise OptionError(
             f"study '{name}' has looks, which fix what is trained: leave {', '.join(words)} out; "
