@@ -89,7 +89,7 @@ class EntryResults(Shown):
     first_thresholds:
         The thresholds in force when its first seed was trained; None if not recorded.
     records:
-        Facts by seed, with left-out seeds: `epochs`, `finished`, core-`hours`, circuit `executions`, and `diverged`, the
+        Number of its color and pattern in pictures, kept where others are left out; None takes the next number.
         first epoch after which its agent's numbers were not finite.
     refused:
         One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
