@@ -1,4 +1,4 @@
-"""What is accepted of a remote worker's answer: nothing in it is believed before it is written.
+"""Checks of a remote worker's answer: nothing in it is believed before it is written.
 
 A worker that is broken, out of date or somebody else's costs the group that it answers for, and no more: what is
 written can be read, ranked and continued like what was trained here.
@@ -35,7 +35,7 @@ _TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Expected:
-    """What an entry's own code says of its answers.
+    """The shapes and sizes of an answer, computed by the entry's own code.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Expected:
 
 
 def expected_of(trainer: Trainer) -> Expected:
-    """Return what answers of a trainer's entry hold; it has begun with one seed."""
+    """Return the expected content of answers for a trainer's entry; the trainer has begun with one seed."""
     state, policy = trainer.capture(), trainer.policy()
     size = sum(array.nbytes for arrays in (state, policy) for array in arrays.values())
     return Expected(trainer.models.trained(), _layouts(state), _layouts(policy), size)
@@ -87,7 +87,7 @@ def require_fit(
 def _problems(
     header: Mapping[str, Any], arrays: Arrays, asked: Asked, task: TaskFile, expected: Expected
 ) -> Iterator[str]:
-    """Yield what does not fit; what follows the first may be nonsense."""
+    """Yield problems of an answer; problems after the first may be nonsense."""
     last: Any = header.get("epoch")
     lines: Any = header.get("lines")
     timings: Any = header.get("timings")
@@ -179,7 +179,7 @@ def _timing_problems(timing: object, number: int, seeds: int) -> Iterator[str]:
 
 
 def _origin_problems(made: object) -> Iterator[str]:
-    """Check where an answer comes from: a table of texts and numbers, and of tables of these."""
+    """Check an answer's provenance: a table of texts, numbers, and tables of texts and numbers."""
     if not isinstance(made, dict) or not isinstance(made.get("versions"), dict):
         yield "it does not say where it was made"
         return

@@ -1,4 +1,4 @@
-"""All that an engine needs of the suite: what it is handed, what it returns, and what helps it in between.
+"""All that an engine needs of the suite: its input, its result, and helpers.
 
 An engine decides only *where* groups of seeds are trained. There are two ways:
 

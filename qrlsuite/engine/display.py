@@ -27,7 +27,7 @@ PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
 
 SILENCE_SECONDS = 20.0
-"""Seconds of training without a finished epoch after which is said what a round takes."""
+"""Seconds of training without a finished epoch before the time of a round is printed."""
 
 DAY = 86400.0
 
@@ -36,14 +36,14 @@ PHASES = {
     "compiling": "compiling circuits: once per machine",
     "probing": "probing",
 }
-"""What is shown of a group before its first epoch; none of it is part of an epoch's time."""
+"""Texts for a group's phases before its first epoch, which are no part of an epoch's time."""
 
 
 class Clock:
     """Times one group from its progress: its epochs, and the rounds of its first one.
 
-    The first epoch that a process trains is left out: it holds what happens once (memory that fills up, code that is
-    compiled when it is first run).
+    A process's first epoch is left out, since it includes one-time work (memory that fills up, code that is compiled at
+    its first run).
     """
 
     def __init__(self, epoch: int) -> None:
@@ -80,7 +80,7 @@ class Clock:
 
     @property
     def once(self) -> float:
-        """Seconds for what happens once: the start, and what the first epoch takes more than others."""
+        """Seconds of one-time work: the start, and the extra time of the first epoch."""
         if self.begun is None or self.pace is None:
             return 0.0
         epoch, ended = self.marks[0]
@@ -91,7 +91,7 @@ class Clock:
         return now - self.round_began if self.trains else 0.0
 
     def left(self, epochs: int, now: float) -> float | None:
-        """Return the seconds left; an epoch is never taken to be shorter than what the current one has taken."""
+        """Return the seconds left; an epoch is assumed to take at least as long as the current one so far."""
         if self.pace is None:
             return None
         epoch, ended = self.marks[-1]
@@ -100,7 +100,7 @@ class Clock:
 
 
 class CostEstimate:
-    """Estimates the remaining time from whole epochs: nothing is said before a group's second one has ended."""
+    """Estimates the remaining time from whole epochs, from a group's second epoch on."""
 
     def __init__(self, groups: Sequence[SeedGroup], epochs: int, workers: int) -> None:
         self.groups = {group.id: group for group in groups}
@@ -247,9 +247,9 @@ class RunDisplay:
         self.deadline: float | None = None
         """The moment, by `time.monotonic`, at which training is stopped."""
         self.expected: str | None = None
-        """What is said at the beginning about how long it will take."""
+        """The first estimate of the time that is left, as printed."""
         self.endless = False
-        """Whether more than a day is left, by what was measured."""
+        """Whether more than a day is left, by measurement."""
         self.probing = False
         """Whether a group has made a probe, see `qrlsuite.engine.probe`."""
         self._announced = self._warned = False
@@ -258,7 +258,7 @@ class RunDisplay:
         self._last: dict[str, dict[str, Any]] = {}
 
     def begin(self, submits: bool = False, holders: Sequence[str] = ()) -> None:
-        """Say what will be done, here or by tasks that are submitted and left.
+        """Print the plan, for training here or for submitted tasks.
 
         Parameters
         ----------
@@ -349,12 +349,12 @@ class RunDisplay:
             self.console.print(text)
 
     def _phase(self, snapshot: Mapping[str, Mapping[str, Any]]) -> str:
-        """Say what is done where no time is known yet: the earliest phase that a group is in."""
+        """Return the text shown before any time is known: the earliest phase of a group."""
         phases = {str(state.get("phase")) for state in snapshot.values() if state} or {"starting"}
         return next((text for phase, text in PHASES.items() if phase in phases), "measuring")
 
     def _announce(self, left: float) -> None:
-        """Say once, after the second epoch, what the rest will take."""
+        """Print once, after the second epoch, the time that is left."""
         self._announced = True
         self.endless |= left > DAY
         if left >= 10:
@@ -363,7 +363,7 @@ class RunDisplay:
             self._advise()
 
     def _warn(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> None:
-        """Say once that a round of the first epoch takes long, and what is faster."""
+        """Warn once that a round of the first epoch takes long, and name a faster way."""
         waited = self.estimate.slowest_round(now)
         rounds = max((int(state.get("total") or 0) for state in snapshot.values()), default=0)
         if waited < SILENCE_SECONDS / 2:
@@ -398,7 +398,7 @@ class RunDisplay:
         )
 
     def out_of_time(self, budget: str) -> None:
-        """Say that training stopped as it was asked to, how far it is, and how to go on."""
+        """Print that the budget has ended, the epochs so far, and the command that continues."""
         self.close()
         epochs = _range([int(state.get("epoch") or 0) for state in self._last.values()] or [0])
         limit = "--budget" if self.again == "command" else "`budget`"
@@ -409,7 +409,7 @@ class RunDisplay:
         )
 
     def finished(self, summary: dict[str, Any], at_work: Sequence[GroupStatus] = ()) -> None:
-        """Sum the run up with the groups that others train, and say what to type next."""
+        """Print a summary, the groups that others train, and the next command."""
         self.close()
         for group in at_work:
             self.console.print(printable(group.text), markup=False, soft_wrap=True)

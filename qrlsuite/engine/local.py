@@ -1,6 +1,6 @@
 """Local processes: one per group, a few at a time, restarted when they die.
 
-A worker that is killed loses at most what it did since its last checkpoint, and disturbs no other.
+A killed worker loses at most the work since its last checkpoint, and disturbs no other worker.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
 
 ATTEMPTS = 3
-"""Deaths of a group's worker, without a finished epoch between them, after which it is given up."""
+"""Deaths of a group's worker, without a finished epoch between them, before the group is given up."""
 
 IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
 """Signals with which a cluster warns its jobs. They reach every process; a worker saves when its supervisor says so."""
@@ -41,7 +41,7 @@ class WorkerJob:
         self.output: IO[bytes] | None = None
 
     def take_output(self) -> str:
-        """Return what an ended process printed, and close the file that holds it."""
+        """Return the output of an ended process, and close its file."""
         if self.output is None or self.output.closed:
             return ""
         with self.output:
@@ -49,14 +49,14 @@ class WorkerJob:
             return self.output.read().decode(errors="replace").strip()
 
     def died(self, reason: str, text: str) -> str | None:
-        """Count a death; returns why the group is given up, None where it is to be started again.
+        """Count a death; return why the group is given up, None if it is to be started again.
 
         Parameters
         ----------
         reason:
             How the process ended: `signal SIGKILL`.
         text:
-            What it printed.
+            Output of the process.
         """
         epoch = int(self.progress.read().get("epoch") or 0)
         self.deaths = 1 if epoch > self.epoch_at_death else self.deaths + 1
@@ -68,7 +68,7 @@ class WorkerJob:
 
 
 def usable_cores() -> int:
-    """Return the number of cores that this process may use; where the system does not say, that of the machine."""
+    """Return the number of cores that this process may use, or the machine's number if the system does not tell."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1  # macOS
@@ -85,7 +85,7 @@ class LocalEngine:
         return requested or usable_cores()
 
     def queued(self, store: EntryStore) -> set[int]:
-        """Return nothing: what waits for a local process waits in that process."""
+        """Return no seeds: local seeds wait in this process."""
         return set()
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
@@ -156,7 +156,7 @@ def _ignore_warnings() -> None:
 
 
 def _ended(job: WorkerJob, code: int, outcome: EngineOutcome) -> bool:
-    """Judge an ended worker; returns whether to try again, else enters what became of it in the outcome."""
+    """Judge an ended worker; return whether to try again, else record its end in the outcome."""
     text = job.take_output()
     if code == 0:
         return False

@@ -46,12 +46,12 @@ def find(
     seeds: Sequence[int] | None = None,
     epochs: int | None = None,
 ) -> Missing:
-    """Find out what of an entry is missing in a results folder; writes nothing.
+    """Find an entry's missing seeds in a results folder; writes nothing.
 
     Parameters
     ----------
     seeds, epochs:
-        None takes those of the task's protocol.
+        None takes the task's protocol.
     """
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
@@ -72,16 +72,16 @@ class Training:
     Attributes
     ----------
     work:
-        What was missing when it began.
+        The missing seeds when it began.
     submitted:
-        One line about what was handed to a queue; None where it was trained.
+        One line about seeds handed to a queue; None if they were trained.
     """
 
     work: Missing
     submitted: str | None
 
     def summary(self) -> dict[str, Any]:
-        """Return what there is by now, as plain values."""
+        """Return a summary of the finished seeds as plain values."""
         return summarize(self.work)
 
 
@@ -95,7 +95,7 @@ def run(
     confirmed: bool = True,
     quiet: bool = False,
 ) -> Training:
-    """Train what of an entry is missing, and say what it came to.
+    """Train an entry's missing seeds and print a summary.
 
     Parameters
     ----------
@@ -123,10 +123,10 @@ def run(
 def require_same_code(
     runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False
 ) -> list[CodeIdentity]:
-    """Return the entries' code; refuse those of which another code has begun seeds, before anything is planned.
+    """Return the entries' code; refuse an entry if other code has begun its seeds, before anything is planned.
 
-    With `where.fresh`, such seeds are set aside, which is said unless `quiet`; with `where.same`, the codes are
-    declared to be the same.
+    With `where.fresh`, such seeds are set aside, with a line unless `quiet`; with `where.same`, the codes are
+    declared to be equal in effect.
     """
     if where.fresh and where.same is not None:
         raise OptionError(
@@ -150,7 +150,7 @@ def require_same_code(
 
 
 def require_trainable(entries: Sequence[Entry], where: Where) -> None:
-    """Refuse what cannot be trained together, before anything is trained or handed to a queue: wrong actions, say."""
+    """Refuse entries whose parts do not fit (wrong actions, say), before anything is trained or queued."""
     from qrlsuite.training import trainer  # imports torch
 
     for entry in {entry.population_key: entry for entry in entries}.values():
@@ -187,7 +187,7 @@ def train(
     confirmed: bool = True,
     code: CodeIdentity | None = None,
 ) -> EngineOutcome:
-    """Train what is planned, showing progress; returns how it ended.
+    """Train the planned groups, showing progress; return how it ended.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def expected(work: Missing, where: Where) -> str | None:
 
 
 def check_memory(work: Missing, where: Where) -> None:
-    """Refuse what does not fit into this machine's memory; a GPU's and a cluster's are not known."""
+    """Refuse groups that do not fit into this machine's memory; the memory of a GPU or a cluster is unknown."""
     if where.device == "cpu" and not where.remote:
         groups = [group.seeds for group in work.groups]
         memory.require(work.entry, groups, where.workers, memory.available())
@@ -299,7 +299,7 @@ def _check_device(name: str) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove the folder of an entry of which nothing could be built, and those above it that are then empty."""
+    """Remove the folder of an entry that could not be built, and empty folders above it."""
     shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(OSError):
         folder.parent.rmdir()
@@ -307,7 +307,7 @@ def _remove(folder: Path) -> None:
 
 
 def _newest_probe(work: Missing) -> str | None:
-    """Say what the probe of these seeds has found, and what it took; None where there is none."""
+    """Describe the newest probe of these seeds, with its cost; None without one."""
     for seed in work.todo:
         probe = probes.of_record(work.store.seed(seed).record() or {})
         if probe and probe["result"] != probes.DIFFERS:

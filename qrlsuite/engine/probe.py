@@ -1,7 +1,7 @@
 """Probes that a seed does not depend on its company: the middle one of a group, trained again alone in a fresh process.
 
-Statistics over seeds mean nothing where seeds influence each other. `qrlsuite check` looks for that at toy size before
-anything is trained; a probe looks at what is trained. Both trainings go from nothing until the parameters have changed,
+Statistics over seeds mean nothing if seeds influence each other. `qrlsuite check` tests that at toy size before any
+training; a probe tests the real training. Both trainings go from nothing until the parameters have changed,
 and must agree in every record and every number of the state, to the last bit. The built-in things are held by the
 suite's tests and are not probed.
 
@@ -10,8 +10,8 @@ suite's tests and are not probed.
 - A group that begins is one side itself, and its middle seed, alone, the other. A group of one is the other side, and
   three seeds are trained in a fresh process. Of a group of two, or one that goes on from a checkpoint, both sides are
   trained in fresh processes.
-- A probe is made once for the same code on the same kind of device, by whoever holds its claim; what it found is in
-  `run.json` of the seeds that were there. Seeds that depend on their company are trained no further and never ranked.
+- A probe is made once per code and kind of device, by the holder of its claim; its result is in `run.json` of the seeds
+  that existed. Seeds that depend on their company are trained no further and never ranked.
 
 `python -m qrlsuite.engine.probe ANSWER PARENT` is the fresh process: it reads what to train from stdin.
 """
@@ -54,7 +54,7 @@ _FOLDER = "probe"
 
 
 def code_of(entry: Entry) -> str:
-    """Return what tells the code of an entry from other code: a probe of the same code is not repeated."""
+    """Return the digest of an entry's code: a probe of equal code is not repeated."""
     return identity.of(entry).digest
 
 
@@ -83,7 +83,7 @@ class Recorder:
         lines:
             The epoch's line of every seed.
         state:
-            What `Trainer.capture` returned after it.
+            Result of `Trainer.capture` after it.
         """
         self.side.lines.append(lines[self._place])
         self.side.arrays = {name: array[self._place, None] for name, array in state.items()}
@@ -110,7 +110,7 @@ def _different(first: Arrays, second: Arrays) -> str:
 
 
 def difference(together: Side, alone: Side) -> str:
-    """Say what differs first; nothing where all is equal."""
+    """Name the first difference; empty if there is none."""
     for number, (line, other) in enumerate(zip(together.lines, alone.lines), start=1):
         for name in line:
             if line[name] != other.get(name):
@@ -152,7 +152,7 @@ class _ProbeFailed(Exception):
 def in_fresh_process(
     entry: Entry, seeds: Sequence[int], epochs: int, device: str, start: Path | None = None
 ) -> tuple[Side, float]:
-    """Do what `train` does in a process that has run nothing else; returns its processor time, too."""
+    """Run `train` in a process that has run nothing else; return its processor time, too."""
     task: dict[str, Any] = {
         "entry": EntryRecord.of(entry).content,
         "seeds": list(seeds),
@@ -224,7 +224,7 @@ class Probe:
         return changed or len(self._recorder.side.lines) >= self.epochs
 
     def judge(self) -> dict[str, Any]:
-        """Train in fresh processes what is missing, and compare; returns what `run.json` stores under `probe`."""
+        """Train the missing sides in fresh processes, and compare; return the value of `probe` in `run.json`."""
         self._made = True
         began, seed = time.monotonic(), self.seed
         found: dict[str, Any] = {
@@ -245,7 +245,7 @@ class Probe:
         return {**found, "result": EQUAL, "epochs": epochs, **cost}
 
     def _compare(self) -> tuple[int, bool, str, float]:
-        """Return the epochs that were compared, whether parameters changed, what differs, and the processor time."""
+        """Return the compared epochs, whether parameters changed, the first difference, and the processor time."""
         seed, cpu = self.seed, 0.0
         sides = []
         for seeds in ([abs(seed - 1), seed, seed + 1 + (seed == 0)], [seed]):

@@ -1,4 +1,4 @@
-"""Trains groups of seeds on workers that see no results folder: sends tasks, accepts answers, writes what comes.
+"""Trains groups of seeds on workers that see no results folder: sends tasks, checks answers, writes results.
 
 This process holds the claims, tells the trackers and writes the results folder. A group is with one worker at a time,
 for about a minute: a task has its newest checkpoint, the answer the next one with the lines between. A worker that is
@@ -57,7 +57,7 @@ MOST_SENT = 512 << 20
 """Bytes of tasks that are with the engine at a time, at most: a scheduler keeps them in memory."""
 
 REPEATED = 20
-"""Of so many answers, the first is compared with that of a second worker, where the engine can choose one."""
+"""The first of this many answers is compared with a second worker's, if the engine can choose workers."""
 
 AT_LENGTH = 1e9
 """Seconds for which a task trains that ends at an epoch."""
@@ -71,7 +71,7 @@ HEADER_BYTES = 1 << 20
 
 @functools.lru_cache(maxsize=64)
 def _expected(entry_hash: str, record: bytes) -> Expected:
-    """Return what an answer holds of one seed."""
+    """Return the expected content of an answer for one seed."""
     import torch
 
     from qrlsuite.training.trainer import Trainer
@@ -368,7 +368,7 @@ class _Claims(threading.Thread):
         self.require()
 
     def release(self, seeds: tuple[int, ...]) -> None:
-        """Give seeds back, if they are held."""
+        """Release the claim of seeds, if there is one."""
         with self._lock:
             claim = self._held.pop(seeds, None)
             if claim is not None:

@@ -46,7 +46,7 @@ class Column:
         Per row the ends of a bar's solid and shaded part, in shares of the longest; None where there is no bar.
         Only a terminal shows them.
     meaning:
-        What the column shows, for those who ask; empty where the head says it.
+        Explanation of the column; empty if the head is enough.
     """
 
     head: str
@@ -79,7 +79,7 @@ class Sheet:
     explained:
         Whether all notes, and the meanings of the columns that are written, stand below the table.
     lines:
-        What stands below the table in any case.
+        Lines that always stand below the table.
     label:
         By which LaTeX refers to it.
     name:
@@ -236,7 +236,7 @@ def _with_bar(column: Column, place: int, length: int) -> str:
 
 
 def _plain(text: str, further: str = "`|") -> str:
-    """Return Markdown that shows a text as it is: labels and options are strangers' words.
+    """Return Markdown that shows a text literally: labels and options are strangers' words.
 
     An underscore within a word stands for itself, as in `batch_size`.
 
@@ -311,7 +311,7 @@ _SPECIAL = {
 
 
 def escaped(text: str) -> str:
-    r"""Return text that LaTeX prints as it is, on one line.
+    r"""Return LaTeX that prints a text literally, on one line.
 
     >>> print(escaped("lr=2e-3 50% & a_b"))
     lr=2e-3 50\% \& a\_b

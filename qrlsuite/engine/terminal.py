@@ -22,7 +22,7 @@ _AGAIN: contextvars.ContextVar[Literal["command", "call"]] = contextvars.Context
 
 
 def again() -> Literal["command", "call"]:
-    """Return what continues work that has stopped, for messages: the same command, or the same call of a function."""
+    """Return the way to continue stopped work, for messages: repeat the command, or the call of a function."""
     return _AGAIN.get()
 
 

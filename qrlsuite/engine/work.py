@@ -1,4 +1,4 @@
-"""What is handed to an engine and what it returns; engines import it from `qrlsuite.engine.api`."""
+"""An engine's input and result; engines import them from `qrlsuite.engine.api`."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Missing:
     epochs:
         The epoch to which each is to be trained.
     busy:
-        Those that another process trains, or that wait in a queue.
+        Seeds that another process trains, or that wait in a queue.
     groups:
-        The rest of those that are missing.
+        The other missing seeds, in groups.
     """
 
     runs: Path
@@ -54,7 +54,7 @@ class Missing:
 
     @property
     def left(self) -> int:
-        """Epochs to train, summed over the seeds; none for those that an interrupted longer run has already."""
+        """Epochs to train, summed over the seeds; 0 for seeds that an interrupted longer run has already trained."""
         return sum(len(group.seeds) * max(0, self.epochs - group.epoch) for group in self.groups)
 
     @property
@@ -70,8 +70,8 @@ class Work:
     Attributes
     ----------
     others:
-        Folders of further entries, of which the same seeds are trained in the same populations; only an engine whose
-        groups run on this machine is given any. `worker_command` names them.
+        Folders of further entries whose seeds are trained in the same populations; only an engine whose groups run on
+        this machine gets any. `worker_command` names them.
     """
 
     store: EntryStore
@@ -117,7 +117,7 @@ class Engine(Protocol):
     """A place where groups run; built as `factory(options)`, `options` None for a spec without options."""
 
     def workers(self, requested: int | None) -> int:
-        """Return how many groups may run at a time, given what the user asked for."""
+        """Return how many groups may run at a time, given the requested number."""
 
     def queued(self, store: EntryStore) -> set[int]:
         """Return the seeds of an entry that were handed to this engine before and still wait for their turn."""
@@ -131,14 +131,14 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a task.
+    """The outcome of a task.
 
     Attributes
     ----------
     key:
         With which the task was sent.
     content:
-        What `work_on` returned for it, None where the task was lost, as when its worker died.
+        The result of `work_on`, None if the task was lost (its worker died, for example).
     problem:
         Why it was lost.
     """
@@ -159,7 +159,7 @@ class Link(Protocol):
         key:
             New for every task.
         priority:
-            Tasks with a higher one go first where they can; those of groups that have begun have a higher one.
+            Tasks with a higher priority go first if possible; groups that have begun have a higher priority.
         """
 
     def receive(self, seconds: float) -> list[Answer]:
@@ -189,8 +189,8 @@ class RemoteEngine(Engine, Protocol):
         workers:
             How many tasks will be sent at a time.
         versions:
-            What a worker must have: versions of distributions, and of `python`. `work_on` refuses where they differ;
-            a link that knows which worker has what sends it nothing.
+            Required versions of distributions, and of `python`, on a worker. `work_on` refuses other versions; a link
+            that knows its workers' versions sends such a worker nothing.
         """
 
 

@@ -1,7 +1,7 @@
 """The process that trains one group: `python -m qrlsuite.engine.worker FOLDER --seeds 0:50 --epochs 100`.
 
-Every engine starts this. It claims its seeds, trains those that have not finished, and leaves everything in the
-entry's folder: to start it again is never wrong. Exit codes: 0 finished, 2 wrong input or a failing environment
+Every engine starts this. It claims its seeds, trains the unfinished ones, and leaves everything in the entry's
+folder: starting it again is always right. Exit codes: 0 finished, 2 wrong input or a failing environment
 (the message is in `progress.json`), 3 the seeds belong to another worker, 130 interrupted with everything saved.
 
 The environment variable `QRLSUITE_CHECKPOINT_SECONDS` replaces the minute between two checkpoints.
@@ -60,17 +60,17 @@ def train_group(
     parent: int | None = None,
     others: Sequence[Path] = (),
 ) -> None:
-    """Claim seeds and train those of them that have not finished, in this process.
+    """Claim seeds and train the unfinished ones in this process.
 
-    Usually they are at the same epoch and make one group; those that another worker trained meanwhile are trained
-    apart.
+    Usually all are at one epoch and make one group. Seeds that another worker trained meanwhile make groups of their
+    own.
 
     Parameters
     ----------
     parent:
         The process without which this one shall not go on.
     others:
-        Folders of further entries, of which the same seeds are trained in the same population.
+        Folders of further entries whose seeds are trained in the same population.
     """
     from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
 
@@ -158,9 +158,9 @@ def checkpoint_seconds(default: float) -> float:
 
 
 def _import_training() -> None:
-    """Import what trains, and set the time between checkpoints; the errors are those of `checkpoint_seconds`.
+    """Import the training code, and set the time between checkpoints; raises the errors of `checkpoint_seconds`.
 
-    What is imported lives as long as the process: the garbage collector does not look at it, now or later.
+    Imported objects live as long as the process: the garbage collector does not look at them, now or later.
     """
     gc.disable()
     try:

@@ -5,12 +5,12 @@ of seeds the results are looked at, and at which error (`qrlsuite.statistics.seq
 own, in a folder of its own:
 
     <runs>/decisions/<name>/plan.toml           the study as it was when its first seed began
-                            looks.jsonl         when the first seed was begun and each look taken, and what it found
+                            looks.jsonl         times of the first seed and of each look, and the look's results
                             <task>/<entry>/...  as in any results folder; each seed's record has the study's hash
 
-What is decided follows from the study and the curves alone. The log is not read to decide anything: it says when each
-look was taken, and reveals curves that were changed after it. Leaderboards do not read this folder: seeds whose number
-depends on what they showed have no p-value of a fixed number of seeds.
+Decisions follow from the study and the curves alone. The log decides nothing: it has the time of each look, and reveals
+curves that were changed after it. Leaderboards do not read this folder: if the number of seeds depends on results, the
+p-value of a fixed number of seeds does not hold.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FOLDER = "decisions"
 """Below the results folder: studies with looks have a folder each, so that leaderboards do not rank their seeds."""
 FILE, LOG = "plan.toml", "looks.jsonl"
 LONG = 40
-"""Characters of a name beyond which a new study leaves out what all of its names share."""
+"""Characters of a name beyond which a new study leaves out the common part of its names."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class StudyState:
-    """What the folder of a study with looks held when it was read, and what is decided by it.
+    """The content of a study's folder when it was read, and the decisions.
 
     Attributes
     ----------
@@ -85,11 +85,11 @@ class StudyState:
     taken:
         When each look was taken, by its number of seeds.
     seeds:
-        Of each entry the seeds that have finished, from the block's first on without a gap.
+        Finished seeds of each entry, from the block's first on without a gap.
     curves:
         Their learning curves; entries without any are absent.
     hours:
-        Of each entry the core-hours of all its seeds, unfinished ones too.
+        Core-hours of each entry, with its unfinished seeds.
     """
 
     begun: bool
@@ -122,7 +122,7 @@ class StudyWithLooks:
     entries:
         The entries by the name that verdicts use, in the study's order.
     design:
-        What is tested when.
+        The tests, and the looks at which they are made.
     questions:
         For each pair the question that it answers; empty where the study asks none.
     folder:
@@ -246,7 +246,7 @@ class StudyWithLooks:
         return self.looks.first_seed + max(1000, len(self.looks.block))
 
     def begin(self) -> None:
-        """Keep the study as it is now, before its first seed."""
+        """Store the study in its present form, before its first seed."""
         begun = self.check()
         if begun:
             self._require_code_of_new_entries()
@@ -261,7 +261,7 @@ class StudyWithLooks:
                 append(self.folder / LOG, json_line({"begun": _now(), "plan": self.hash}))
 
     def _require_code_of_new_entries(self) -> None:
-        """Refuse an entry that has no seed yet, where its code is not what the study's hash covers."""
+        """Refuse an entry without seeds if its code is not the code in the study's hash."""
         for table, (name, entry) in zip(self.file.entries, self.entries.items()):
             store = EntryStore.find(self.folder, entry)
             begun = store.path.is_dir() and bool(store.seeds())
@@ -384,9 +384,9 @@ def new(
         preset=FILE.toml`. A setting `preset=FILE.toml` gives the values of a preset file, with the record of how they
         were found.
     first_seed:
-        None for the first block from 10,000 of which no seed was trained below `runs`.
+        None for the first block from 10,000 without a trained seed below `runs`.
     looks:
-        What else `LooksSection` has; None takes the default.
+        Further fields of `LooksSection`; None takes the default.
     """
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     looks |= {"written": now, "first_seed": first_seed}
@@ -483,7 +483,7 @@ def _common_epochs(source: str, entries: Sequence[Entry]) -> int:
 
 
 def _fixed_table(member: Member, named: bool) -> EntriesSection:
-    """Return what the study says of an entry: a preset file's values and record, so that the file can change later."""
+    """Return an entry's table with the values and the record of its preset file, so that the file can change later."""
     table, entry = member.table, member.entry
     if table.hash is not None:
         return table
@@ -568,7 +568,7 @@ def _lines(design: SequentialDesign, decision: Decision) -> list[dict[str, Any]]
 
 
 def _names(entries: Sequence[Entry]) -> list[str]:
-    """Return what verdicts call the entries: the shortest of label without algorithm, label and name that is unique."""
+    """Return the names of entries in verdicts: label without algorithm, label or name, the shortest unique one."""
     short = [entry.label.partition(" ")[2] for entry in entries]
     labels = [entry.label for entry in entries]
     result = []
@@ -579,7 +579,7 @@ def _names(entries: Sequence[Entry]) -> list[str]:
 
 
 def _first(log: Sequence[Mapping[str, Any]], key: str, hash_: str | None = None) -> str | None:
-    """Return when the log first says that something happened, to the study of a hash where one is given."""
+    """Return the time of the first event of a kind in the log, of the study with a hash if one is given."""
     lines = (line for line in log if key in line and hash_ in (None, line.get("plan")))
     return next((str(line[key]) for line in lines), None)
 

@@ -1,4 +1,4 @@
-"""What a study with looks has come to, on a screen, on a page and as plain values."""
+"""The outcome of a study with looks, for a screen, a page, and as plain values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from qrlsuite.studies.looks import StudyState, StudyWithLooks
 from qrlsuite.studies.study import load_kept
 
 Pair = TypeVar("Pair")
-"""What is known of a pair: its decision, or more."""
+"""A pair's decision, or more facts on it."""
 
 NEAR = 0.9
 """Share of the horizon that entries spend below thresholds, beyond which they can hardly be told apart."""
@@ -39,12 +39,12 @@ Hours = tuple[float, float]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StudyOutcome(Shown):
-    """A study with looks and what it has decided so far.
+    """A study with looks and its decisions so far.
 
     Attributes
     ----------
     state:
-        What its folder holds; its `decision` has every pair with its verdict, p at each look, difference and interval.
+        Content of its folder; `decision` has every pair with its verdict, p at each look, difference and interval.
     submitted:
         One line for each entry whose seeds were handed to a queue.
     """
@@ -55,7 +55,7 @@ class StudyOutcome(Shown):
 
     @property
     def pairs(self) -> tuple[PairDecision, ...]:
-        """The pairs that are compared; `verdict` says in words what was decided of each."""
+        """The compared pairs; `verdict` is a pair's decision in words."""
         return self.state.decision.pairs
 
     @property
@@ -197,7 +197,7 @@ class StudyOutcome(Shown):
         yield from self.parts()
 
     def parts(self) -> Iterator[Text | Sheet]:
-        """Return what a screen shows: what is asked; the design while it can be changed, then pairs and needs; cost."""
+        """Return the parts of a screen: the question; the design before the first seed, later the pairs; the cost."""
         study, state, facts = self.study, self.state, self.as_dict()
         yield Text(f"{study.name}: {study.file.summary}", style="bold")
         if not state.begun:
@@ -244,7 +244,7 @@ class StudyOutcome(Shown):
         return f"{pair.verdict}, at the horizon" if self.late(pair) else pair.verdict
 
     def _design(self) -> Iterator[str]:
-        """Say what is fixed when the first seed is trained."""
+        """Describe the design, which is fixed when the first seed is trained."""
         study, section = self.study, self.study.looks
         family = len(study.design.family)
         written = f"written {section.written:%Y-%m-%d %H:%M} UTC, " if section.written else ""
@@ -264,7 +264,7 @@ class StudyOutcome(Shown):
             )
 
     def _cost(self, facts: Mapping[str, Any]) -> Iterator[str]:
-        """Say what was used and saved, and what comes next."""
+        """Describe the seeds and hours used and saved, and the next look."""
         if not self.state.begun:
             most = facts["core_hours_at_most"]
             cost = (
@@ -290,7 +290,7 @@ class StudyOutcome(Shown):
 
 
 def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome], list[str]]:
-    """Return what the studies that have begun in a results folder have decided, and a line for each unreadable one.
+    """Return the outcomes of the studies that have begun in a results folder, and a line for each unreadable study.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome]
 
 
 def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
-    """Return each question of a study with what is known of its pairs, in order; an empty text where none is asked."""
+    """Return each question of a study with its pairs, in order; the text is empty if the study asks none."""
     texts = study.questions or [""] * len(pairs)
     return [
         (text, [pair for _, pair in group])
@@ -370,7 +370,7 @@ def _leading_text(pair: PairDecision, grid: Grid) -> str:
 
 
 def needs_text(outcome: StudyOutcome, needs: Mapping[str, Any] | None) -> str:
-    """Say what an open pair needs, as `as_dict` gives it."""
+    """Describe the `needs` of an open pair from `as_dict`."""
     if needs is None or outcome.state.ended:
         return ""
     requirement = f"p <= {needs['level']:.2g} at {needs['seeds']} seeds"

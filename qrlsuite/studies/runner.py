@@ -94,9 +94,9 @@ class Overview(Shown):
     Attributes
     ----------
     pairs:
-        Of the pairs of entries those that are decided, and all that can be tested yet.
+        Numbers of decided pairs, and of pairs that can be tested yet.
     published:
-        Of each entry, by its name, the seeds that come with the suite; None leaves them out.
+        Numbers of published seeds by entry; None leaves them out.
     """
 
     study: Study
@@ -128,7 +128,7 @@ class Overview(Shown):
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show the study's question, a row per entry, and what is left."""
+        """Show the study's question, a row per entry, and the remaining work."""
         file = self.study.file
         yield Text(file.summary, style="bold")
         if file.source:
@@ -173,13 +173,13 @@ class Overview(Shown):
 
 
 def _total(items: Sequence[PendingEntry]) -> tuple[float, float]:
-    """Return the least and the most core-seconds left of the items whose cost is known."""
+    """Return the least and the most core-seconds left, of items with known cost."""
     ranges = [item.range or (0.0, 0.0) for item in items]
     return sum(low for low, _ in ranges), sum(high for _, high in ranges)
 
 
 def _left(items: Sequence[PendingEntry], workers: int) -> str:
-    """Write what items take: by the clock with a number of workers, in core-hours, and how many are of unknown cost."""
+    """Write the cost of items: time with a number of workers, core-hours, and the number of items of unknown cost."""
     low, high = _total(items)
     unknown = sum(item.seconds is None for item in items)
     more = f", and {counted(unknown, 'entry')} of unknown cost" if unknown else ""
@@ -202,7 +202,7 @@ def select(
     settings, models:
         As for `Study.members`; every model that takes the place of another has to be registered.
     only:
-        Words, of which an entry's group, label or task has one; or names of entries. Empty takes all.
+        Words that occur in an entry's group, label or task; or names of entries. Empty takes all.
     """
     for new in (models or {}).values():
         registry.get(specs.ModelSpec, new)
@@ -233,7 +233,7 @@ def find_pending(
     Parameters
     ----------
     seeds, epochs:
-        None takes those of each task's protocol.
+        None takes each task's protocol.
     """
     groups: dict[tuple[str, str], list[str]] = {}
     for member in members:
@@ -254,16 +254,16 @@ def work_left(items: Sequence[PendingEntry]) -> tuple[int, float]:
 
 
 def cheapest_first(items: Sequence[PendingEntry]) -> list[PendingEntry]:
-    """Return the items that lack something: the least core-seconds first, then those of unknown cost."""
+    """Return the items with missing seeds: the least core-seconds first, items of unknown cost last."""
     lacking = [item for item in items if item.missing.groups]
     return sorted(lacking, key=lambda item: (item.seconds is None, item.seconds or 0.0))
 
 
 def fitting(item: PendingEntry, seconds: float, workers: int) -> list[int]:
-    """Return the missing seeds that can be trained within a time: those that have least to go first.
+    """Return the missing seeds that can be trained within a time, the seeds with the fewest epochs left first.
 
-    Where nothing of this very entry was measured yet, half of the time is planned for, at most: the next look will
-    rest on a measurement. Where nothing is known at all, one seed per worker.
+    If nothing of this entry was measured yet, at most half of the time is planned: the next plan will rest on a
+    measurement. If nothing is known at all, one seed per worker.
     """
     if item.estimate.seconds is None:
         return item.missing.todo[:workers]
@@ -286,7 +286,7 @@ def fitting(item: PendingEntry, seconds: float, workers: int) -> list[int]:
 
 
 def dry_run(items: Sequence[PendingEntry], budget: float | None, workers: int) -> list[dict[str, Any]]:
-    """Return what would be trained, in this order: `PendingEntry.as_dict` with the number of seeds, `would_train`.
+    """Return the planned training, in order: `PendingEntry.as_dict` with the number of seeds, `would_train`.
 
     Parameters
     ----------
@@ -338,9 +338,9 @@ class Session:
     _began: float | None = None
 
     def run(self, items: Sequence[PendingEntry]) -> list[PendingEntry]:
-        """Train what is missing, cheapest first; returns the items that did not fit into the budget.
+        """Train missing seeds, cheapest items first; return the items that did not fit into the budget.
 
-        The budget counts from the first call: that of several studies is one.
+        The budget counts from the first call: several studies share one.
         """
         if self._began is None:
             self._began = self.clock()
@@ -361,7 +361,7 @@ class Session:
         return left_over
 
     def _batch(self, item: PendingEntry, chosen: list[int], title: str) -> PendingEntry:
-        """Train some seeds of an item; returns what is left of it."""
+        """Train some seeds of an item; return the rest of the item."""
         work = item.missing
         complete = sorted(set(work.seeds) - set(work.todo) - set(work.busy))
         part = find(self.runs, work.entry, self.where, sorted([*complete, *chosen]), work.epochs)
@@ -396,7 +396,7 @@ def take_looks(study: StudyWithLooks, session: Session) -> StudyOutcome:
     Parameters
     ----------
     session:
-        In the study's folder. Unless it is quiet, it says what every look decides.
+        A session in the study's folder. Unless it is quiet, it prints the decisions of every look.
     """
     require_same_code(study.folder, list(study.entries.values()), session.where, session.quiet)
     study.begin()
@@ -416,7 +416,7 @@ def take_looks(study: StudyWithLooks, session: Session) -> StudyOutcome:
 
 
 def _say_look(decision: Decision, console: Console) -> None:
-    """Say what the newest look decided, while more is trained."""
+    """Print the decisions of the newest look, while more is trained."""
     looks = max((len(pair.p) for pair in decision.pairs), default=0)
     if not looks:
         return

@@ -1,7 +1,7 @@
 """Studies as data: one TOML file names the entries of an experiment, the pictures of it, and what a paper reports.
 
-A study trains nothing of its own: its entries are those that `qrlsuite run` would train, in the same folders, so
-that entries which several studies share are trained once. A study with a table `[looks]` compares its entries with as
+A study has no training of its own: `qrlsuite run` would train its entries in the same folders, so that several
+studies share the seeds of an entry. A study with a table `[looks]` compares its entries with as
 many seeds as it takes, on seeds of its own: see `qrlsuite.studies.looks`.
 """
 
@@ -33,7 +33,7 @@ LARGEST = 1000
 
 
 class MatchSection(Table):
-    """An option that is computed: the value whose parameter count is nearest to that of another group's entry."""
+    """A computed option: the value whose parameter count is nearest to the count of another group's entry."""
 
     option: Annotated[
         str, Field(min_length=1, description="an integer option of the model that sets its size")
@@ -209,7 +209,7 @@ class StudyFile(Table):
 
 @dataclass(frozen=True)
 class Member:
-    """An entry of a study, the group that it belongs to, and the group's table with what makes this entry alone."""
+    """An entry of a study, its group, and the group's table reduced to this entry."""
 
     group: str
     entry: Entry
@@ -281,7 +281,7 @@ class Study:
 
 @dataclass(frozen=True)
 class _Draft:
-    """What is about to become an entry."""
+    """An entry in the making."""
 
     task: str
     written: notation.Written
@@ -292,7 +292,7 @@ def _listed(names: str | list[str]) -> list[str]:
 
 
 def setting(key: str, word: str, value: Any) -> Setting:
-    """Return what `NAME = VALUE` or `"SIDE.NAME" = VALUE` in a file's table `key` sets."""
+    """Return the setting of `NAME = VALUE` or `"SIDE.NAME" = VALUE` in a file's table `key`."""
     side, dot, name = word.rpartition(".")
     return Setting(side if dot else None, name, value, f"{key}.")
 
@@ -365,7 +365,7 @@ def parse(text: str, source: str, folder: Path | None = None) -> Study:
     Parameters
     ----------
     folder:
-        Of the file: what the paths in its key `plugins` are relative to.
+        Folder of the file: the paths in its key `plugins` are relative to it.
     """
     content = files.parse(text, source)
     own.load_named(content.pop("plugins", []), folder, source)
@@ -387,7 +387,7 @@ def _with_table(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def question_of(names: Sequence[str]) -> str:
-    """Return what is asked about all pairs of some entries."""
+    """Return the question about all pairs of some entries."""
     if 0 < len(names) <= 4:
         return f"Which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
     return f"Which of {len(names)} entries needs the fewest steps?" if names else "Which needs fewer steps?"

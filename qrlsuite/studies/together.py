@@ -1,4 +1,4 @@
-"""What several studies with looks say together: the pairs that all of them compare, on average over their tasks.
+"""Several studies with looks together: the pairs that all of them compare, on average over their tasks.
 
 A study may stop a pair early, at a look where the difference happened to be large. So only the seeds of each study's
 first look count here: every pair has them, whatever they showed.
@@ -59,7 +59,7 @@ class SharedPair:
 class StudiesTogether(Shown):
     """Several studies with looks, each of a task of its own, which compare entries of the same names.
 
-    Entries of one name may have other options on another task: those that were tuned for it, for example.
+    Entries of one name may have other options on another task: for example, options that were tuned for it.
     """
 
     studies: tuple[StudyOutcome, ...]
@@ -94,7 +94,7 @@ class StudiesTogether(Shown):
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The seeds of each entry that count on each task: those of the study's first look."""
+        """Numbers of seeds that count on each task: the seeds of the study's first look."""
         return tuple(each.study.design.looks[0] for each in self.studies)
 
     @staticmethod
@@ -138,7 +138,7 @@ class StudiesTogether(Shown):
 
     @cached_property
     def pairs(self) -> tuple[SharedPair, ...]:
-        """The pairs that all studies compare, in the order of the first study; without those that have no ratio."""
+        """The pairs that all studies compare and that have a ratio, in the order of the first study."""
         known = {named: ratio for named, ratio in self._ratios.items() if not isinstance(ratio, str)}
         adjusted = holm(np.array([ratio.p for ratio in known.values()])).tolist()
         return tuple(SharedPair(*named, ratio, p) for (named, ratio), p in zip(known.items(), adjusted))
@@ -184,7 +184,7 @@ class StudiesTogether(Shown):
         yield from self.parts()
 
     def parts(self) -> Iterator[Text | Sheet]:
-        """Return what a screen shows: a table for each question, and what its numbers are."""
+        """Return the parts of a screen: a table for each question, with explanations."""
         names = ", ".join(each.study.name for each in self.studies)
         yield Text(f"{names}: B against A, on each task and on average", style="bold")
         questions = list(dict.fromkeys(pair.question for pair in self.pairs))

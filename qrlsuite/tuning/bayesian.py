@@ -1,7 +1,7 @@
 """The search that says how good its settings are: it goes on until the expected regret is small, or the budget ends.
 
-Settings are chosen by `qrlsuite.tuning.surrogate`. First come the untuned setting, those given by hand, and a few that
-are spread over the ranges (a Halton sequence); then, twelve at a time, those that may be the best, new or tried before.
+Settings are chosen by `qrlsuite.tuning.surrogate`. First come the untuned setting, settings given by hand, and a few
+spread over the ranges (a Halton sequence); then, twelve at a time, settings that may be the best, new or tried before.
 Each time they are trained on seeds that no setting had before, to the whole horizon: poor settings get fewer seeds, and
 never fewer epochs, which would favor settings that begin fast.
 
@@ -39,9 +39,9 @@ class Bayesian(Search):
     Attributes
     ----------
     searched:
-        The ranges as far as they were extended, by option.
+        The ranges with their extensions, by option.
     taken:
-        Settings that were given by hand and have no option that is not varied, as they were given.
+        Settings given by hand that set only varied options.
     """
 
     def _begin(self) -> None:
@@ -156,12 +156,12 @@ class Bayesian(Search):
 
     @property
     def _pace(self) -> float:
-        """Core-seconds of a run, by those so far; 0 before any."""
+        """Mean core-seconds of a run so far; 0 before the first."""
         return self.core_seconds / self.runs_done if self.runs_done else 0.0
 
     @property
     def budget_text(self) -> str:
-        """Say what the search is allowed, in words that are equal for models with equal budgets."""
+        """Return the search's budget, in words that are equal for models with equal budgets."""
         goal = f"expected regret {self.request.regret:.0%}"
         if self._climb.regret is not None and self.regret_reached:
             return goal
@@ -275,19 +275,19 @@ class Bayesian(Search):
 
     @property
     def ordered(self) -> list[Trial]:
-        """The settings from best to worst by the surrogate, each on all its seeds; those of this round last."""
+        """The settings from best to worst by the surrogate, each on all its seeds."""
         known = [self._latest[number] for number in self._climb.order if number in self._latest]
         return known or sorted(self.trials, key=lambda trial: (trial.merit.order, trial.number))
 
     @property
     def at_edge(self) -> list[str]:
-        """Options of which nothing was tried beyond the best value."""
+        """Options whose best value is the lowest or highest that was tried."""
         edges = self._climb.edges([*self._latest]) if self._latest else []
         return [self.space[d].name for d, _ in edges if self.space[d].range is not None]
 
     @property
     def regret_text(self) -> str:
-        """Say how good the chosen settings are, and what speaks against them; empty before anything is known."""
+        """Describe the regret of the chosen settings, with doubts; empty before it is known."""
         regret = self._climb.regret
         if regret is None:
             return ""
@@ -307,7 +307,7 @@ class Bayesian(Search):
         return {**super().as_dict(), "regret": None if regret is None else regret.model_dump()}
 
     def _how(self) -> dict[str, Any]:
-        """Return what the record says of how settings were chosen."""
+        """Return the record of the choice of settings."""
         regret = self._climb.regret
         return {
             "trials": len(self.trials),

@@ -1,4 +1,4 @@
-"""The progress of a search as it is shown: its size and cost, a bar, a line per trial."""
+"""Shows the progress of a search: its size and cost, a bar, a line per trial."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class TuneDisplay:
         self._per_run: float | None = None
         """Seconds of one seed of a trial, by the pace of the trials that are trained now or were last."""
         self._done = 0
-        """Trials before those that are trained now."""
+        """Number of trials before the ones in training."""
         self._said: set[str] = set()
 
     def begin(self) -> None:
-        """Say how large each search is, and what it will cost as far as that is known."""
+        """Print the size of each search, and its cost as far as it is known."""
         total: tuple[float, float] | None = (0.0, 0.0)
         bases: dict[str, None] = {}
         for search in self.searches:
@@ -68,14 +68,14 @@ class TuneDisplay:
             )
 
     def _cost(self, search: Search) -> tuple[tuple[float, float] | None, str]:
-        """Return the least and the most core-seconds of a whole search, None where unknown, and what that rests on."""
+        """Return the least and the most core-seconds of a whole search (None if unknown), and their basis."""
         runs = len(search.request.seeds) * (search.beside if self.where.room > 1 else 1)
         together = min(LARGEST_GROUP, math.ceil(runs / self.where.workers))
         estimate = speed.known(search.runs, search.results).estimate(search.base, together)
         return estimate.range(search.runs_planned * search.epochs), speed.BASES[estimate.basis]
 
     def begin_trials(self, works: Sequence[Missing]) -> None:
-        """Show that trials begin, of which some may have finished before."""
+        """Show that trials begin; some may have finished before."""
         self._works = ()
         self._done = sum(search.asked for search in self.searches) - sum(bool(work.groups) for work in works)
         for work in works:
@@ -87,7 +87,7 @@ class TuneDisplay:
         self.bar.start(sum(search.planned for search in self.searches), "tuning")
 
     def training(self, works: Sequence[Missing]) -> None:
-        """Show that some of these trials are trained now, side by side."""
+        """Show that some of the trials are now trained side by side."""
         self._done += len(self._works)
         self._works = works
         self._clock = Clock(min(group.epoch for work in works for group in work.groups))
@@ -141,7 +141,7 @@ class TuneDisplay:
         )
 
     def regret(self, search: Search) -> None:
-        """Show how good the best settings are and what that took, where it is known and has changed."""
+        """Show the regret of the best settings and the cost so far, if the regret is known and has changed."""
         said = f"{search.base.label}: {search.regret_text}"
         if search.regret_text and said not in self._said:
             self._said.add(said)

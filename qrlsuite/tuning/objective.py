@@ -91,7 +91,7 @@ def merit(
 
 
 def cell_text(ranking: RankingSection, objective: Objective) -> str:
-    """Say in words what is minimized."""
+    """Return the objective in words."""
     if objective == "time":
         steps = f"M, the mean number of steps {ranking.before} threshold"
         return f"{steps} over the task's {len(ranking.grid.levels)} thresholds"

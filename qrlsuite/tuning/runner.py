@@ -63,10 +63,10 @@ def run(
 ) -> bool:
     """Run trials, then write the preset file of each search that has a best trial and waits for none.
 
-    After Ctrl-C, the files have the best settings so far; one with more runs behind it stays as it is.
+    After Ctrl-C, the files have the best settings so far; a file with more runs behind it stays unchanged.
 
-    No trials are begun that would not end within the requests' budget of time, one after the other and at the pace of
-    those before. Trials that an earlier call finished cost no time.
+    A trial is begun only if it would end within the requests' budget of time, at the pace of the trials before.
+    Trials that an earlier call finished cost no time.
 
     Parameters
     ----------

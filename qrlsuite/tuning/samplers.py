@@ -1,6 +1,6 @@
-"""In which order settings are tried. Every sampler is fixed by its seed: a repeated search proposes the same.
+"""Samplers choose the order of settings. A sampler is fixed by its seed: a repeated search proposes equal settings.
 
-`total` trials are proposed; more of them begin with the same ones, but for a whole grid.
+`total` trials are proposed. A larger total begins with the same trials, except for a whole grid.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ REGRET = 0.05
 
 @pydantic.dataclasses.dataclass(frozen=True)
 class SamplerOptions:
-    """What is written behind a sampler's name."""
+    """Options of a sampler, written behind its name."""
 
     trials: Annotated[int | None, pydantic.Field(ge=1, le=100_000)] = None
     seed: Annotated[int, pydantic.Field(ge=0)] = 0
@@ -53,7 +53,7 @@ class Sampler(Protocol):
     total: int
     """How many points there will be."""
     adaptive: bool
-    """Whether a proposal depends on the values of those before."""
+    """Whether a proposal depends on the values of earlier trials."""
 
     def ask(self) -> Point:
         """Return the next point."""
@@ -144,7 +144,7 @@ def _short(value: float) -> float:
 
 
 class Listed:
-    """Points that are known beforehand."""
+    """A list of points, fixed beforehand."""
 
     adaptive = False
 
@@ -165,8 +165,8 @@ class Listed:
 class Tpe:
     """Optuna's tree-structured Parzen estimator (Bergstra et al. 2011), with a fixed seed.
 
-    The study lives in memory. A repeated search asks and tells the same, and so replays it: nothing but the runs
-    themselves is stored.
+    The study lives in memory. A repeated search asks and tells in the same order, and so replays it: only the runs
+    are stored.
     """
 
     adaptive = True

@@ -1,7 +1,7 @@
 """A search: trial by trial, each an ordinary set of runs below `<runs>/tuning/`, until the best is a preset file.
 
-A search keeps no state of its own. Interrupted and begun again, it proposes the same trials, finds those that have
-finished on the disk, and ends with the same preset (but for the measured hours).
+A search keeps no state of its own. Interrupted and begun again, it proposes the same trials, finds the finished ones
+on the disk, and ends with the same preset (except for the measured hours).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Train = Callable[[Sequence[Entry], Sequence[int], int], Sequence[EntryStore]]
 
 
 def tuning_seeds(requested: int | str | Iterable[int]) -> tuple[int, ...]:
-    """Return the seeds that are meant, as `read_seeds` reads them, but that a number counts from 1,000,000."""
+    """Like `read_seeds`, but a bare number counts from 1,000,000."""
     seeds = tuple(read_seeds(requested))
     if isinstance(requested, int) or (isinstance(requested, str) and requested.isdecimal()):
         return tuple(TUNING_SEEDS + seed for seed in seeds)
@@ -68,9 +68,9 @@ class Request:
     Attributes
     ----------
     entry:
-        What is tuned, as `qrlsuite.notation.parse_entry` reads it. All trials share its settings, and those given here.
+        The entry to tune, as `qrlsuite.notation.parse_entry` reads it. All trials share its settings.
     grid, varied:
-        What is varied: a grid file, and options with lists of values of their own.
+        The varied options: a grid file, and options with their own lists of values.
     trials, sampler_seed:
         See `qrlsuite.tuning.samplers`, and for `bayesian` `qrlsuite.tuning.bayesian`.
     regret:
@@ -78,11 +78,11 @@ class Request:
     rows:
         With `bayesian`, settings that are tried first: `lr=.002 buffer=10000` or `preset=FILE.toml`.
     budget:
-        Of time; or of core-hours, with `bayesian`: as many trials as these hold.
+        A time; or core-hours, with `bayesian`: as many trials as fit.
     seeds:
         Tuning seeds of every trial; with `bayesian` of the first ones, and others as many numbers on.
     epochs:
-        Of every trial; None for the task's protocol.
+        Epochs of every trial; None for the task's protocol.
     """
 
     task: str
@@ -127,8 +127,8 @@ def read_requests(
     vary:
         See `qrlsuite.tuning.space.read_varied`.
     sampler:
-        A name with options, `random trials=50 seed=1`; None takes all combinations of what is listed, else, or where
-        settings are given, `bayesian`.
+        A name with options, `random trials=50 seed=1`. None takes all combinations of listed values; `bayesian` if a
+        range is varied or settings are given.
     seeds:
         As `tuning_seeds` reads them; None takes `SEEDS`.
     """
@@ -167,7 +167,7 @@ def preset_path(out: str | PathLike[str] | None, requests: Sequence[Request]) ->
 
 @dataclass(frozen=True)
 class Proposal:
-    """Settings to be tried: their number, the seeds to be trained, and those of the same settings' earlier trials."""
+    """Settings to try: their number, the seeds to train, and the seeds of earlier trials of these settings."""
 
     number: int
     point: space.Point
@@ -183,9 +183,9 @@ class Trial:
     Attributes
     ----------
     number:
-        Of its settings, in the order in which they were first tried.
+        Number of its settings, in the order of first trials.
     core_seconds:
-        Of its runs, those of earlier trials of the same settings too.
+        Core-seconds of its runs, with earlier trials of these settings.
     seeds, round:
         All that the settings were tried on so far; rounds of `bayesian` count from 0.
     spread:
@@ -252,7 +252,7 @@ class Search(Shown):
         )
 
     def _space(self, declared: bool) -> space.Space:
-        """Return what is varied, with the ranges that algorithm and model declare, if they shall count."""
+        """Return the search space; `declared` adds the ranges that algorithm and model declare."""
         request = self.request
         ranges = space.declared(self.base) if declared else {}
         return space.space(self.base, request.grid, request.varied, self.notation.settings, ranges)
@@ -438,7 +438,7 @@ class Search(Shown):
         )
 
     def _how(self) -> dict[str, Any]:
-        """Return what the record says of how settings were chosen."""
+        """Return the record of the choice of settings."""
         return {
             "trials": len(self.trials),
             "planned": self.planned,

@@ -1,4 +1,4 @@
-"""Search spaces: which values of which options are tried.
+"""Search spaces: the varied options and their values.
 
 A grid is a TOML file, `[search.ALGORITHM.FAMILY]` with lists of values by option, each of the two a name or
 `all`:
@@ -12,10 +12,9 @@ A grid is a TOML file, `[search.ALGORITHM.FAMILY]` with lists of values by optio
     [search.ddqn.classical]
     width = [16, 64]
 
-A range (`low`, `high`, and `log = true` for learning rates) is for samplers that draw. Option names are those of
-`--set`, with `algorithm.` or `model.` before them where both have one; `"activation_in+activation_out"` gives both
-options the same value. Grids of a name lie in a folder `search`
-beside the task files, the suite's and those of plugins.
+A range (`low`, `high`, and `log = true` for learning rates) is for samplers that draw. Option names are written as in
+`--set`, with `algorithm.` or `model.` before them if both have one; `"activation_in+activation_out"` gives both options
+one value. Named grids lie in a folder `search` beside the task files of the suite and of plugins.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Range(Table):
 
     @property
     def integer(self) -> bool:
-        """Whether only integers are meant."""
+        """Whether the range is of integers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
 
@@ -72,7 +71,7 @@ class Dimension:
     range: Range | None = None
 
     def plain(self) -> Any:
-        """Return it as it stands in a grid file."""
+        """Return the dimension as in a grid file."""
         if self.range is None:
             return list(self.values)
         log = {"log": True} if self.range.log else {}
@@ -117,8 +116,8 @@ def load(name: str) -> GridFile:
 def declared(entry: Entry) -> dict[str, Range]:
     """Return the ranges of the options that an entry's algorithm and model mark as tuned, by full name.
 
-    Options that the entry's other options leave without effect are left out: those that are then refused, and those of
-    quantum parameters where a circuit stays as it was drawn.
+    Options without effect beside the entry's other options are left out: refused options, and options of quantum
+    parameters if the circuit stays as drawn.
     """
     from qrlsuite.training.trainer import count_parameters  # torch is slow to import
 
@@ -154,7 +153,7 @@ def space(
     fixed: Sequence[Setting] = (),
     ranges: Mapping[str, Range] | None = None,
 ) -> Space:
-    """Return what is varied for an entry.
+    """Return the search space of an entry.
 
     Parameters
     ----------
@@ -167,7 +166,7 @@ def space(
     fixed:
         Options that shall not be varied.
     ranges:
-        What is varied without a grid file, by full name.
+        Varied ranges without a grid file, by full name.
     """
     sides = {"model": specs.resolve(entry.model.options), "algorithm": specs.resolve(entry.algorithm.options)}
     axes: dict[str, list[Any] | Range] = dict(ranges or {})
@@ -216,7 +215,7 @@ def _full_name(word: str, sides: Mapping[str, type[Any]], prefix: str) -> str:
     Parameters
     ----------
     prefix:
-        What stands before it where it was written, for messages.
+        Text before the name in the user's words, for messages.
     """
     parts = []
     for part in word.split("+"):
@@ -275,7 +274,7 @@ def read_varied(
 
 
 def _values(name: str, value: Any) -> list[Any] | Range:
-    """Read what `--vary` gives: a list, or a range as an inline table."""
+    """Read the value of `--vary`: a list, or a range as an inline table."""
     if isinstance(value, list):
         return value
     if isinstance(value, dict):

@@ -6,15 +6,15 @@ Williams 2006, chapter 2; by scikit-learn) describes the logarithm of the mean s
     log mean steps at x = m + f(x),      f ~ GP(0, s^2 Matern_5/2(|x - x'| / l)),
     measured with n runs: that + error of variance v / n.
 
-Prior: m is normal around the median of what was measured, with standard deviation 1; log s is normal around log 0.5
-with 0.5, and the logarithm of each length l around log 0.7 with 0.7. s and l are those most probable after the data.
+Prior: m is normal around the median of the measurements, with standard deviation 1; log s is normal around log 0.5
+with 0.5, and the logarithm of each length l around log 0.7 with 0.7. s and l take their most probable posterior values.
 Draws of f from the posterior answer two questions:
 
-- *Regret*: exp(f(chosen) - min f) - 1 of a draw, the minimum over what was tried and some hundred other places. Its
+- *Regret*: exp(f(chosen) - min f) - 1 of a draw, the minimum over tried places and some hundred other places. Its
   mean over draws is the expected regret.
-- *What next*: the places where draws have their minimum (Thompson 1933), whether they were tried before or not. Where
-  what trains together has to share some options, it is the first few values of these that draws ask for, and then the
-  minima of further draws among places that have them.
+- *Next places*: the minima of draws (Thompson 1933), whether they were tried before or not. If places that train
+  together must share some options, the first draws choose a few values of these options, and further draws have their
+  minima among places with these values.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class Regret:
 def variances(means: Floats, spreads: Floats, counts: Floats) -> Floats:
     """Return the variance of a run at each place, in units of the squared mean.
 
-    What runs show of their own place's spread is drawn to the spread of the better half of all places, and that to
-    `SPREAD`: at poor places runs may all end at the horizon, and show none.
+    The spread measured at a place is shrunk to the spread of the better half of all places, and that to `SPREAD`: at
+    poor places all runs may end at the horizon, and show no spread.
 
     Parameters
     ----------
@@ -106,21 +106,21 @@ class Climb:
     snap:
         Returns the nearest place that can be tried.
     encode:
-        Returns what the surrogate takes a place for: numbers that are near for options with like effects.
+        Returns a place's coordinates for the surrogate: numbers that are near for options with like effects.
     extends:
         Tells whether option d may go on beyond its range, `low` and `high` in places.
     seed:
-        Of everything that is drawn.
+        Seed of all draws.
     shared:
-        Options in which places are cheaper together if they are alike: each `DESIGN` of those that come first are, and
-        later ones have at most `BATCH` / `DESIGN` different values of them at once.
+        Options that make places cheaper to train together if they are equal: each `DESIGN` first places share them, and
+        later batches have at most `BATCH` / `DESIGN` different values of them.
 
     Attributes
     ----------
     tried:
         Places in the order in which they were proposed.
     low, high:
-        (D,): what is searched, at first 0 and 1.
+        (D,): the searched range, at first 0 and 1.
     best:
         The chosen place: the one where the surrogate's mean is least.
     order:
@@ -161,7 +161,7 @@ class Climb:
         return places
 
     def _add(self, place: Floats) -> int | None:
-        """Return the number of a place, new among those to be tried; None where it is not new."""
+        """Add a place to try and return its number; None if it is not new."""
         place = np.asarray(self._snap(place), np.float64)
         if place.tobytes() in self._known:
             return None
@@ -232,7 +232,7 @@ class Climb:
         surrogate: Surrogate,
         generator: np.random.Generator,
     ) -> tuple[list[Floats], Floats]:
-        """Return places, those of the numbers first, and the log steps at each in each draw."""
+        """Return places, the numbered ones first, and the log steps at each in each draw."""
         places = [*(self.tried[number] for number in numbers), *others]
         return places, surrogate.draws(np.array([self._encode(place) for place in places]), generator)
 
@@ -258,7 +258,7 @@ class Climb:
         return list(distinct.values())
 
     def edges(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
-        """Return the options of which nothing was tried beyond the best value, with the side: -1 or 1."""
+        """Return the options whose best value is the lowest (-1) or highest (1) that was tried."""
         measured = np.array([self.tried[number] for number in numbers])
         best = self.tried[self.best]
         least, most = best <= measured.min(axis=0), best >= measured.max(axis=0)
