@@ -59,14 +59,14 @@ RUNS = [
 
 def machine() -> dict[str, Any]:
     """Return what the bits of floating-point results depend on: the processor, and who computes on it."""
-    from llvmlite import binding
+    from numba.core.registry import cpu_target
 
     made = provenance.collect([])
     return {
         "system": made["system"],
         "processor": made["processor"],
         "torch kernels": torch.backends.cpu.get_cpu_capability(),
-        "numba target": binding.get_host_cpu_name(),
+        "numba target": cpu_target.target_context.codegen().magic_tuple()[1],
         **{name: made["versions"][name] for name in ("torch", "numpy", "numba")},
     }
 
