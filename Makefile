@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long breaks test-lowest verify docs tutorials site pictures statements dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-vectors test-long breaks test-lowest verify docs tutorials site pictures statements dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -18,6 +18,16 @@ test: install-dev
 	ln -sfn $(CURDIR)/qrlsuite/* $(CURDIR)/plugins $(CURDIR)/leaderboard $(CURDIR)/tasks $(VENV)/package/qrlsuite
 	cd $(VENV) && MYPYPATH=package bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15
+	$(MAKE) test-vectors
+
+# Tests whose numbers are rounded by the vectors of the processor, with torch's kernels and numba's code for another one:
+# by default for any, without vectors beyond the architecture's. `make test-vectors ATEN=avx2 NUMBA=haswell` is for AVX2.
+ATEN ?= default
+NUMBA ?= generic
+VECTORS ?= tests/circuits/test_native.py tests/core/test_layers.py tests/core/test_population.py \
+  tests/core/test_earlier_versions.py tests/core/test_seeds_are_independent.py tests/testing/test_broken_models.py
+test-vectors: install-dev
+	ATEN_CPU_CAPABILITY=$(ATEN) NUMBA_CPU_NAME=$(NUMBA) NUMBA_CPU_FEATURES= $(BIN)/python -m pytest -q $(VECTORS)
 
 # What is long by nature, before a release: CONTRIBUTING.md says what, and when it last passed.
 test-long: install-dev
@@ -98,8 +108,11 @@ install: $(BIN)/python
 
 install-dev: $(VENV)/editable
 
+# By uv, which takes a sixth of pip's processor time; by pip where uv does not find all of it: it does not read pip's
+# settings, an index of your own for example.
 $(VENV)/editable: pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet --editable '.[dev,docs]'
+	$(BIN)/pip install --quiet uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[dev,docs]' \
+	  || $(BIN)/pip install --quiet --editable '.[dev,docs]'
 	touch $@
 
 # The CPU build of torch first: a plain install would bring gigabytes of CUDA packages. With an NVIDIA GPU,

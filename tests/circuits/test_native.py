@@ -305,51 +305,15 @@ def test_copies_share_the_compiled_program() -> None:
     assert copy.deepcopy(backend) is backend
 
 
-PROCESSORS = {"haswell": 32, "x86-64": 16}
-"""Processors that numba is asked to compile for, and the bytes of their vector registers; the last has no FMA."""
-
-
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="runs code for processors of this architecture")
-@pytest.mark.parametrize(
-    ("processor", "file", "chosen"),
-    [
-        ("x86-64", __file__, ""),
-        *(
-            pytest.param(processor, file, chosen, marks=pytest.mark.long)
-            for processor in PROCESSORS
-            for file, chosen in (
-                (
-                    __file__,
-                    "numbers and kernels or company or finite_differences or linear_algebra or connects",
-                ),
-                (str(Path(__file__).parents[1] / "core/test_layers.py"), "test"),
-            )
-        ),
-    ],
-    ids=["x86-64", *(f"{processor}-{part}" for processor in PROCESSORS for part in ("all", "layers"))],
-)
-def test_other_processors(processor: str, file: str, chosen: str, tmp_path: Path) -> None:
-    """The released code's numbers, seeds in company, any circuit and layers, compiled for a processor with less.
-
-    Compiling takes long; without a choice of tests only the width of the vectors is looked at.
-    """
-    if processor == "haswell" and "fma" not in Path("/proc/cpuinfo").read_text():
-        pytest.skip("this processor has no AVX2 and FMA")
-    program = (
-        "import sys; from numba import types; from qrlsuite.compiled.vectors import LANES; "
-        "assert LANES == {types.float32: int(sys.argv[1]) // 4, types.float64: int(sys.argv[1]) // 8}, LANES; "
-        "sys.argv[3] or sys.exit(); import pytest; "
-        "sys.exit(pytest.main(['-q', '-x', '-p', 'no:cacheprovider', sys.argv[2], '-k', sys.argv[3]]))"
-    )
-    target = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "QRLSUITE_CACHE": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(PROCESSORS[processor]), file, chosen],
-        env={**os.environ, **target},
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names processors of this architecture")
+def test_vectors_fill_the_registers_of_the_processor_that_numba_compiles_for() -> None:
+    program = "from qrlsuite.compiled.vectors import FUSED, lanes; print(4 * lanes('float32'), FUSED)"
+    for processor, found in (("x86-64", "16 False"), ("haswell", "32 True"), ("skylake-avx512", "64 True")):
+        env = {**os.environ, "NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ""}
+        words = [sys.executable, "-c", program]
+        assert (
+            subprocess.run(words, env=env, capture_output=True, text=True, check=True).stdout.strip() == found
+        )
 
 
 def test_code_for_arm_has_vectors_and_fused_multiplications() -> None:
