@@ -284,7 +284,8 @@ def changes(before: Any, now: Any, where: str = "") -> Iterator[str]:
         for place, (one, other) in enumerate(zip(before, now)):
             yield from changes(one, other, f"{where}[{_name(one, place)}]")
     elif not _same(before, now):
-        yield f"{where}: {_short(before)} -> {_short(now)}"
+        begin = _difference(before, now)
+        yield f"{where}: {_short(before, begin)} -> {_short(now, begin)}"
 
 
 def _name(row: Any, place: int) -> Any:
@@ -300,9 +301,21 @@ def _same(before: Any, now: Any) -> bool:
     return type(before) is type(now) and bool(before == now)
 
 
-def _short(value: Any) -> str:
+def _difference(before: Any, now: Any) -> int:
+    """Return a place shortly before the first difference of two texts."""
+    if not (isinstance(before, str) and isinstance(now, str)):
+        return 0
+    different = (place for place, (one, other) in enumerate(zip(before, now)) if one != other)
+    return max(0, next(different, 0) - 20)
+
+
+def _short(value: Any, begin: int = 0) -> str:
     text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 100 else f"{text[:99]}…"
+    return (
+        text
+        if len(text) <= 100
+        else f"{'…' * (begin > 0)}{text[begin : begin + 99]}{'…' * (begin + 99 < len(text))}"
+    )
 
 
 def differences(group: str, every: int = 1) -> list[str]:

@@ -44,7 +44,13 @@ def test_nearly_all_questions_have_an_answer(group: str) -> None:
     assert len(answers) > 4 * len(refused)
 
 
-STORED: Any = {"p": 0.012, "ranks": [1, 2], "tied": False, "rows": [{"entry": "mlp", "time": 40114.25}]}
+STORED: Any = {
+    "p": 0.012,
+    "ranks": [1, 2],
+    "tied": False,
+    "text": 60 * "a b" + "c",
+    "rows": [{"entry": "mlp", "time": 40114.25}],
+}
 
 
 @pytest.mark.parametrize(
@@ -58,6 +64,10 @@ STORED: Any = {"p": 0.012, "ranks": [1, 2], "tied": False, "rows": [{"entry": "m
         ({**STORED, "tied": 0}, ["tied: false -> 0"]),
         ({**STORED, "rows": [{"entry": "mlp"}]}, ["rows[mlp].time: 40114.25 -> gone"]),
         ({**STORED, "tier": 1}, ["tier: new -> 1"]),
+        (
+            {**STORED, "text": 60 * "a b" + "d"},
+            ['text: …a ba ba ba ba ba ba bc" -> …a ba ba ba ba ba ba bd"'],
+        ),
     ],
 )
 def test_a_change_is_said_with_its_place(now: Any, said: list[str]) -> None:
