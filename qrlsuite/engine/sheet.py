@@ -251,11 +251,16 @@ def _plain(text: str, further: str = "`|") -> str:
 
 
 def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
-    """Write rows of equal columns; lists are separated by semicolons. No rows are nothing."""
+    """Write rows, empty where one lacks a column of another; lists are separated by semicolons. No rows are nothing.
+
+    >>> csv_rows([{"task": "pulse"}, {"task": "vqe-h2", "cost": 0.5}]).split()
+    ['task,cost', 'pulse,', 'vqe-h2,0.5']
+    """
     if not rows:
         return ""
     buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(buffer, list(names), lineterminator="\n")
     writer.writeheader()
     for row in rows:
         flat = {name: "; ".join(value) if isinstance(value, list) else value for name, value in row.items()}
