@@ -120,7 +120,7 @@ def load(command: LazyCommand) -> Any:
 
 
 def split_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a command's words without `--plugin PATH`, and the paths: what these register is what words name."""
+    """Return a command's words without `--plugin PATH`, and the paths: plugins register the names that words use."""
     rest, paths = list[str](), list[str]()
     left = iter(words)
     for word in left:

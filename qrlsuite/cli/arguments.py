@@ -12,7 +12,7 @@ import typer
 
 
 def names_of(kind: str) -> Callable[[str], list[str]]:
-    """Return what completes the beginning of a registered name: `kind` is as in `qrlsuite list`."""
+    """Return a function that completes a registered name; `kind` is as in `qrlsuite list`."""
 
     def complete(incomplete: str) -> list[str]:
         from qrlsuite import registry, specs

@@ -35,7 +35,7 @@ def add_commands(app: typer.Typer, registry: Registry) -> None:
 def _added(
     app: typer.Typer, commands: list[Any], groups: list[Any], callback: Any
 ) -> tuple[list[Any], list[Any]]:
-    """Return the commands and groups that were added to those before."""
+    """Return the commands and groups that were added to the earlier ones."""
     first, second = app.registered_commands[: len(commands)], app.registered_groups[: len(groups)]
     if first != commands or second != groups or app.registered_callback is not callback:
         raise PluginError("it changes the commands of others or the callback, and may only add commands")

@@ -1,4 +1,4 @@
-"""What can be said about a circuit or a network before and after training: arrays in, arrays out.
+"""Diagnostics of a circuit or a network before and after training: arrays in, arrays out.
 
 - `gradients`: how gradients shrink with the number of qubits;
 - `fisher`: the Fisher information, directions without effect, and the effective dimension;

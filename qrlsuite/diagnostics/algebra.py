@@ -1,4 +1,4 @@
-"""The dynamical Lie algebra of a circuit: what its gates can reach together if their angles are free.
+"""The dynamical Lie algebra of a circuit: all that its gates can reach together if their angles are free.
 
 A circuit is a product of exp(-i angle G) and fixed gates W. Its algebra is spanned by the generators i W^+ G W, with W
 the fixed gates before each, and all their nested commutators. Its dimension says whether a deep circuit can do
@@ -92,7 +92,7 @@ def _matrices(vectors: NDArray[np.float64], d: int) -> Matrix:
 
 
 def _independent(vectors: NDArray[np.float64], basis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return orthonormal vectors that span what vectors add to an orthonormal basis."""
+    """Return orthonormal vectors that extend an orthonormal basis to the span of more vectors."""
     for _ in range(2):  # twice, against rounding
         vectors = vectors - (vectors @ basis.T) @ basis
     values, directions = np.linalg.eigh(vectors.T @ vectors)

@@ -1,4 +1,4 @@
-"""The diagnostics of a circuit at random parameters, drawn as they are initially, and inputs of a standard normal."""
+"""Diagnostics of a circuit at random parameters from its initial distribution, and standard normal inputs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Points(NamedTuple):
 
 
 def draw(circuit: Circuit, count: int, seed: int = 0) -> Points:
-    """Draw inputs of a standard normal, and parameters as they are initially."""
+    """Draw standard normal inputs, and parameters from their initial distribution."""
     if circuit.parameter_count == 0:
         raise OptionError("the circuit has no parameters: diagnostics say how results change with them")
     source = np.random.default_rng(seed)
@@ -66,7 +66,7 @@ def readouts(circuit: Circuit) -> dict[str, Circuit]:
 
 
 def _named(circuit: Circuit) -> int:
-    """Return the number of qubits without those that stand for earlier measurements and resets."""
+    """Return the number of qubits, without the ones that stand for earlier measurements and resets."""
     return circuit.qubits - circuit.deferred
 
 

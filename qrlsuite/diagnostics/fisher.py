@@ -36,7 +36,7 @@ class Information(NamedTuple):
     Attributes
     ----------
     eigenvalues:
-        (P,), the largest first; those that are rounding are 0.
+        (P,), the largest first; rounding errors are set to 0.
     gauge:
         (P,): the part of each parameter that lies in gauge directions, from 0 to 1. They sum to the number of gauge
         directions. NaN where too few states were seen to tell.
@@ -90,7 +90,7 @@ def effective_dimension(
     Parameters
     ----------
     eigenvalues:
-        (T, K), of the Fisher information at T draws of the parameters; those left out are 0.
+        (T, K), of the Fisher information at T draws of the parameters; further eigenvalues are 0.
     samples, gamma:
         n, the number of data, and gamma in (0, 1]. Both change the result: it grows with n towards the largest rank.
     parameters:

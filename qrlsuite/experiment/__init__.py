@@ -1,1 +1,1 @@
-"""Tasks, presets and entries: what is run, and its identity."""
+"""Tasks, presets and entries, and their identity."""

@@ -58,7 +58,7 @@ def _task(name: str) -> dict[str, Any]:
 
 
 def _set_with(spec: specs.Spec) -> str:
-    """Return what to type to change an option of a thing."""
+    """Return the words that change an option of a thing."""
     if not isinstance(spec, specs.AnsatzSpec):
         return "--set NAME=VALUE"
     for model, registered in registry.load().of(specs.ModelSpec).items():

@@ -22,7 +22,7 @@ from qrlsuite.notation import Written
 from qrlsuite.options import Setting
 
 EXTERNAL = "external"
-"""What the algorithm of entries is called whose curves another program made; so is their task's environment."""
+"""Name of the algorithm, and of the task's environment, of entries whose curves another program made."""
 
 START_FORM = re.compile(r"[a-z0-9][a-z0-9+._-]*/[a-z0-9][a-z0-9+._@-]*:[1-9][0-9]{0,8}")
 """Where training begins, see `Entry.start`."""
@@ -41,8 +41,8 @@ class Entry:
     plan:
         Hash of the study with looks that trains it, where one does; not part of the identity either.
     start:
-        `TASK/ENTRY:EPOCHS`, where training begins with the agents of another entry after so many epochs, seed k with
-        that of seed k; part of the identity.
+        `TASK/ENTRY:EPOCHS` if training begins with the agents of another entry after so many epochs, seed k with that
+        entry's seed k; part of the identity.
     """
 
     task: Task
@@ -74,7 +74,7 @@ class Entry:
 
     @property
     def population_key(self) -> str:
-        """Equal for entries whose agents can be trained in one population: those that differ in options per agent only.
+        """Equal for entries that differ in options per agent only: one population can train their agents.
 
         See `per_agent` of `qrlsuite.options.Tuned`.
         """
@@ -134,7 +134,7 @@ class Entry:
         return options.plain(options.build(cls, covered, "preset"))
 
     def registered(self) -> dict[str, registry.Registered[specs.NumericSpec]]:
-        """Return what makes the entry's numbers, by role: environment, algorithm and model.
+        """Return the parts that make the entry's numbers, by role: environment, algorithm and model.
 
         Where the model has them, its `ansatz` and its circuit `backend`, too.
         """
@@ -157,7 +157,7 @@ class Entry:
         return list(dict.fromkeys(each.distribution for each in self.registered().values()))
 
     def third_party(self) -> list[str]:
-        """Return those of the distributions that are not this suite."""
+        """Return the distributions other than this suite."""
         return [name for name in self.distributions() if name != "qrlsuite"]
 
 
@@ -173,12 +173,12 @@ def resolve(
     Parameters
     ----------
     task:
-        Its name or file, or what `qrlsuite.experiment.task.load` made of it.
+        Its name or file, or a result of `qrlsuite.experiment.task.load`.
     entry:
         As `qrlsuite.notation.parse_entry` reads it: a model's name alone, or an entry's label.
     algorithm, settings, preset:
-        What was given beside the text. A preset is one of the task's, or a file's path (anything that ends in `.toml`).
-        A file's values come before those of the task's default preset; settings come before both.
+        Choices beside the text. A preset is one of the task's, or a file's path (anything that ends in `.toml`).
+        A file's values override the task's default preset; settings override both.
     """
     written = entry if isinstance(entry, Written) else notation.parse_entry(entry)
     written = written.given(algorithm, tuple(settings), preset)
@@ -239,7 +239,7 @@ class _Preset:
     tuned: Mapping[str, Mapping[str, Any]]
 
     def record(self, values: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-        """Return what an entry with these own values keeps of the tuning."""
+        """Return the record of tuning for an entry with these own values."""
         if self.tuning is None or self.name is None:
             return None
         return presets.record_of(self.tuning, self.name, self.tuned, values)
@@ -288,7 +288,7 @@ def option_sides(
     Parameters
     ----------
     settings:
-        What was set; `ansatz=NAME` among it chooses the ansatz.
+        The settings; `ansatz=NAME` among them chooses the ansatz.
     defaults:
         The model's options where nothing was set, by name; absent ones have the class's defaults.
     """

@@ -1,6 +1,6 @@
-"""Code identity: what computes an entry's numbers, as content. A name stands for one thing only while this stays.
+"""Code identity: the content of the code that computes an entry's numbers, while names may stand for other code.
 
-    part                      what its identity covers
+    part                      content of its identity
     of the suite itself       its `numerics`, which is raised when its bits change; not its source
     a circuit                 its description, as built: gates, wires, angles, parameters (`canonical`)
     a plugin's other parts    the syntax trees of the modules that its code reaches by imports within its distribution
@@ -49,15 +49,15 @@ class CodeIdentity:
     Attributes
     ----------
     parts:
-        Each has a `role`, a `name` and, but for a file, a `distribution`; and `numerics`, the SHA-256 of a `circuit`,
-        that of each of some `files`, or its own `sha256`.
+        Each has a `role`, a `name`, a `distribution` (except files), and one of: `numerics`, the SHA-256 of a
+        `circuit`, a SHA-256 for each of some `files`, or its own `sha256`.
     """
 
     parts: tuple[Part, ...]
 
     @property
     def text(self) -> str:
-        """What the digest is taken of: canonical JSON."""
+        """Content of the digest: canonical JSON."""
         return json.dumps(self.parts, sort_keys=True, separators=(",", ":"))
 
     @property
@@ -67,7 +67,7 @@ class CodeIdentity:
 
     @property
     def original(self) -> bool:
-        """Whether all code is the suite's, with its first bits: what seeds without a recorded identity have."""
+        """Whether all code is the suite's first version; seeds without a recorded identity have it."""
         return all(
             part.get("distribution") == OURS and part.get("numerics", 1) == 1
             for part in self.parts
@@ -75,12 +75,12 @@ class CodeIdentity:
         )
 
     def record(self) -> dict[str, Any]:
-        """Return what `run.json` stores."""
+        """Return the record in `run.json`."""
         return {"digest": self.digest, "parts": [dict(part) for part in self.parts]}
 
 
 def of(entry: Entry) -> CodeIdentity:
-    """Compute an entry's code identity from what is installed now."""
+    """Compute an entry's code identity from the installed code."""
     parts = [
         _part(role, each, circuit_of(entry) if role == "ansatz" else None, _environment_id(entry, role))
         for role, each in entry.registered().items()
@@ -246,7 +246,7 @@ def _texts(name: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def differences(before: Sequence[Part], now: Sequence[Part], numerics: bool = True) -> list[str]:
-    """Say in words what differs between the parts of two identities; without `numerics`, bits may differ."""
+    """Return the differences between two identities in words; without `numerics`, bits may differ."""
     if not numerics:
         before, now = ([{**part, "numerics": 1} for part in parts] for parts in (before, now))
     old, new = ({(part["role"], part["name"]): part for part in parts} for parts in (before, now))

@@ -1,7 +1,7 @@
 """Preset files: settings in TOML that an entry names (`mlp preset=FILE.toml`), and how they were found.
 
-A preset never decides what an entry is, its values do. But where it was found by tuning, the entry carries the
-record of that, so that a reader of a leaderboard knows how much was spent on the settings.
+A preset's values decide an entry's identity, its name does not. If tuning found the preset, the entry carries the
+record of it, so that a reader of a leaderboard knows the cost of the settings.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RegretRecord(options.Table):
 
 
 class TuningRecord(options.Table):
-    """How settings were found, and what it took; None is what is not known."""
+    """How settings were found, and at which cost; None is unknown."""
 
     task: Annotated[str | None, Field(max_length=80)] = None
     objective: Literal["time", "cell", "area"] | None = None
@@ -88,7 +88,7 @@ class TuningRecord(options.Table):
 
 
 class EntryTuning(TuningRecord):
-    """What an entry keeps of the tuning of its settings (`tuning` in `entry.json`)."""
+    """An entry's record of the tuning of its settings (`tuning` in `entry.json`)."""
 
     preset: Annotated[str | None, Field(description="where the record comes from")] = None
     changed: Annotated[
@@ -96,7 +96,7 @@ class EntryTuning(TuningRecord):
     ] = ()
 
     def plain(self) -> dict[str, Any]:
-        """Return what `entry.json` stores."""
+        """Return the record in `entry.json`."""
         unknown = {name for name in ("runs", "budget", "rungs") if getattr(self, name) is None}
         return self.model_dump(mode="json", exclude=unknown)  # 0.1.0 reads records without these keys only
 
@@ -136,16 +136,16 @@ def record_of(
     chosen: Mapping[str, Mapping[str, Any]],
     values: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return what an entry keeps of the tuning of its preset, see `EntryTuning`.
+    """Return an entry's record of the tuning of its preset, see `EntryTuning`.
 
     Parameters
     ----------
     source:
         The preset's name.
     chosen:
-        What the preset gives, by side (`algorithm`, `model`); a side that it says nothing of is absent.
+        Values of the preset by side (`algorithm`, `model`); a side without values is absent.
     values:
-        What `--set` gave, by side: where that differs from the preset, the record says so.
+        Values of `--set` by side; the record names values that differ from the preset.
     """
     changed = sorted(
         f"{side}.{name}"

@@ -1,7 +1,7 @@
-"""Reads code as what it does: canonical syntax trees, and the modules that imports reach.
+"""Reads code by its effect: canonical syntax trees, and the modules that imports reach.
 
-A tree is written by a walk of our own: fields that are empty do not count, so that those which later versions of Python
-added change nothing. Only the standard library is imported here, and no module that is read is.
+A tree is written by a walk of our own: empty fields do not count, so that fields which later versions of Python added
+change nothing. Only the standard library is imported here; a module that is read is not imported.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def reached(roots: Iterable[str], belongs: Callable[[str, ModuleSpec], bool]) ->
     roots:
         Names of modules.
     belongs:
-        Whether a module, by the name and the spec of its top-level package, is one of those that count.
+        Whether a module counts, by the name and the spec of its top-level package.
     """
     found: dict[str, str] = {}
     seen: set[str] = set()

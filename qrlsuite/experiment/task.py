@@ -64,7 +64,7 @@ class ProtocolSection(options.Table):
 
 
 class ScoreSection(options.Table):
-    """What of an episode is ranked: a score in [0, 1], its return, or a metric of the environment."""
+    """The ranked number of an episode: a score in [0, 1], its return, or a metric of the environment."""
 
     source: Annotated[
         Literal["info", "return"],
@@ -94,7 +94,7 @@ class ScoreSection(options.Table):
 
     @model_serializer(mode="wrap")
     def _without_absent_metric(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what no metric needs: tasks keep the hashes that earlier versions gave them."""
+        """Leave out the fields of metrics if there is none, so that tasks keep the hashes of earlier versions."""
         written: dict[str, Any] = write(self)
         if self.metric is None:
             written = {name: value for name, value in written.items() if name not in ("metric", "goal")}
@@ -122,7 +122,7 @@ class ScoreSection(options.Table):
 
     @property
     def called(self) -> str:
-        """What sentences call it: `score`, or the metric's name."""
+        """Its name in sentences: `score`, or the metric's name."""
         return self.metric or "score"
 
     @property
@@ -228,12 +228,12 @@ class RankingSection(options.Table):
 
     @property
     def before(self) -> str:
-        """The other side, `below` or `above`: what boards count are steps there."""
+        """The other side, `below` or `above`: boards count the steps on it."""
         return self._score.before
 
     @property
     def level_name(self) -> str:
-        """What thresholds are: `epsilon`, `return`, or the metric's name."""
+        """Kind of thresholds: `epsilon`, `return`, or the metric's name."""
         return "epsilon" if self.epsilons is not None else self._score.metric or "return"
 
     @property
@@ -319,7 +319,7 @@ class Task:
     environment_options:
         The environment's options object.
     definition:
-        Everything that a run's numbers depend on, as plain values (but for `options.Since`).
+        Everything that a run's numbers depend on, as plain values (except `options.Since`).
     hash:
         The first 16 hexadecimal digits of SHA-256 over the definition; the key of all random streams.
     """
@@ -367,7 +367,7 @@ class Task:
 
     @property
     def world(self) -> str:
-        """The hash without what changes agents' observations alone: entries of tasks with one world can be compared."""
+        """The hash without options of observations: entries of tasks with one world can be compared."""
         seen = dict.fromkeys(self.environment.views)
         world = {**self.definition, "environment_options": {**self.definition["environment_options"], **seen}}
         return digest(world)
@@ -395,8 +395,8 @@ class Task:
     def preset(self, name: str | None, algorithm: str, family: str) -> tuple[str | None, dict[str, Any]]:
         """Return the chosen preset's name and its values for an algorithm and a model family.
 
-        Where the default preset says nothing about them, there is no preset: the algorithm's defaults are not what a
-        task calls `tuned`.
+        If the default preset has no values for them, there is no preset: the algorithm's defaults are not a task's
+        `tuned` settings.
         """
         chosen = name or self.file.default_preset
         if chosen is None:
@@ -453,7 +453,7 @@ def parse(text: str, source: str, folder: Path | None = None) -> Task:
     source:
         Where it came from, for messages.
     folder:
-        Of the file: what the paths in its key `plugins` are relative to.
+        Folder of the file: the paths in its key `plugins` are relative to it.
     """
     data = _whole(text, source, folder=folder)
     try:
@@ -465,7 +465,7 @@ def parse(text: str, source: str, folder: Path | None = None) -> Task:
 
 
 def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | None = None) -> dict[str, Any]:
-    """Return a file's content, with that of the task which it extends, and load the plugins that it names.
+    """Return a file's content merged with the task that it extends, and load the plugins that it names.
 
     Where it has `extends = TASK`, the content is that task's, with this file's values in place of its own. Tables are
     merged key by key. Every other value, a list too, replaces the one of the extended task; thresholds replace its
@@ -501,7 +501,7 @@ def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | N
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return nested tables with the values of `changes` in place of those of `base`."""
+    """Return the nested tables of `base` with the values of `changes`."""
     tables = {
         key: _merged(base[key], value)
         for key, value in changes.items()
@@ -511,7 +511,7 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _environment_problems(section: Any) -> list[str]:
-    """Return what is wrong with the environment of a file that is not in order elsewhere."""
+    """Return problems of the environment in a file with problems elsewhere."""
     try:
         parsed = EnvironmentSection.model_validate(section)
     except pydantic.ValidationError:

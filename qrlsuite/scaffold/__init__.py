@@ -1,6 +1,6 @@
 """New plugin packages, written from the templates beside this file.
 
-A template `templates/KIND/NAME.jinja` becomes the file NAME of the package; those of `templates/common` become
+A template `templates/KIND/NAME.jinja` becomes the file NAME of the package; templates in `templates/common` become
 files of every package.
 """
 
@@ -49,7 +49,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class _Words:
-    """What is said about a kind: a summary, what to type after installing, and the files besides registration.
+    """Texts of a kind: a summary, the commands after installing, and the files besides registration.
 
     A kind with a task has a range, too: the scores of random actions and of the best policy known.
     """
@@ -109,13 +109,13 @@ class Package:
     Attributes
     ----------
     name:
-        Of the distribution: `acme-ring`.
+        Name of the distribution: `acme-ring`.
     module:
-        What is imported: `acme_ring`.
+        Name to import: `acme_ring`.
     thing:
-        What is registered: the name without a leading `qrlsuite-`.
+        Registered name: the distribution's without a leading `qrlsuite-`.
     commands:
-        What to type once it is installed.
+        Commands to type once it is installed.
     files:
         Text by path within the package.
     """
@@ -133,12 +133,12 @@ def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) ->
     Parameters
     ----------
     name:
-        Of the distribution, `acme-ring`: lower-case words and digits with single hyphens between them.
+        Name of the distribution, `acme-ring`: lower-case words and digits with single hyphens between them.
     kind:
-        What it adds.
+        Kind of thing that it adds.
     scores:
         For a kind with a task: the scores of random actions and of the best policy known, between which its
-        thresholds are spread. Numbers outside [0, 1] are returns. Default: those of the template's environment.
+        thresholds are spread. Numbers outside [0, 1] are returns. Default: scores of the template's environment.
     """
     kinds: tuple[type[specs.Spec], ...] = (
         specs.kind(kind),
@@ -192,7 +192,7 @@ def rendered(values: Mapping[str, object]) -> dict[str, str]:
 
 
 def commands_of(kind: str, thing: str) -> tuple[str, ...]:
-    """Return what to type with a thing once it is installed; nothing where its kind has no template."""
+    """Return the commands for a thing once it is installed; empty if its kind has no template."""
     return (
         tuple(line.format(thing=thing) for line in _WORDS[Kind(kind)].commands)
         if kind in Kind.__members__
@@ -245,7 +245,7 @@ def names_of(name: str, kinds: Sequence[type[specs.Spec]]) -> tuple[str, str]:
     Parameters
     ----------
     kinds:
-        Kinds of which nothing may have the registered name.
+        Kinds in which the registered name must be free.
     """
     if not NAME.fullmatch(name) or len(name) > LONGEST:
         usable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")[:LONGEST].rstrip("-")

@@ -1,4 +1,4 @@
-"""A package made of a plugin by path: its file or folder, with specs for what it registers in short forms."""
+"""Makes a package of a plugin by path: its file or folder, with specs for its short registrations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
     Parameters
     ----------
     name:
-        Of the distribution; None takes that of the file or folder.
+        Name of the distribution; None takes the name of the file or folder.
     """
     made = own.load(path)
     kept = made.registered
@@ -156,7 +156,7 @@ def _before_imports(node: ast.stmt) -> bool:
 
 
 def _register(tree: ast.Module) -> Iterator[tuple[int, int, str]]:
-    """Yield the lines of what calls or imports `register`, and what takes their place."""
+    """Yield the lines of code that calls or imports `register`, and their replacement."""
 
     def named(node: ast.expr) -> bool:
         return (node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")) == "register"

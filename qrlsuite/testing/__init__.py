@@ -1,4 +1,4 @@
-"""Conformance checks: what a plugin author runs before shipping, and what the suite runs on its own plugins.
+"""Conformance checks, for plugin authors before shipping, and for the suite's own plugins.
 
 In pytest, one line:
 
@@ -39,8 +39,8 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
     settings:
         Values of options; others take their defaults (and circuit models two qubits and one layer).
     more:
-        Of an environment: `deterministic=True` where all its episodes are meant to be alike. Of an algorithm or model:
-        `task`, a task or its file, whose environment is taken in place of the toys.
+        For an environment: `deterministic=True` if all its episodes are meant to be equal. For an algorithm or model:
+        `task`, a task or its file, whose environment replaces the toys.
     """
     import importlib
 
@@ -59,7 +59,7 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
 
 
 def assert_conforms(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) -> None:
-    """Fail with every broken rule and its likely cause; the arguments are those of `check`."""
+    """Fail with every broken rule and its likely cause; arguments as for `check`."""
     broken = [finding for finding in check(kind, name_or_spec, settings, **more) if not finding.ok]
     if broken:
         lines = [f"  {finding.rule}: {finding.message}" for finding in broken]

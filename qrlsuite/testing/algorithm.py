@@ -96,7 +96,7 @@ _RESTORES = "load_state_dict() takes what state_dict() returned, or slices of it
 
 
 def _check_more(subject: Subject, world: World, rule: str) -> list[Finding]:
-    """Check what depends on the kind of actions, or on networks that remember."""
+    """Check the rules that depend on the kind of actions, or on networks that remember."""
     rules, trial = Checklist(), Trial(subject, world)
 
     def all_of_it() -> None:
@@ -223,7 +223,7 @@ def _acts(trial: Trial) -> None:
 
 
 def _remembers(trial: Trial) -> None:
-    """What an algorithm remembers of an episode belongs to a lane, and ends with the episode."""
+    """An algorithm's memory of an episode belongs to a lane, and ends with the episode."""
     group = trial.group(range(S)).start()
     group.train()
     seen, begun = group.look(), np.zeros((S, 8), np.bool_)

@@ -145,7 +145,7 @@ def _effects(circuits: Circuits, grows: bool) -> None:
 
 
 def _idle(circuits: Circuits) -> str:
-    """Name what has no effect in the largest circuit of up to three layers."""
+    """Name the parameters and gates without effect in the largest circuit of up to three layers."""
     largest = max(size for size in circuits if size[1] in LAYERS)
     return effects.idle_at_the_ends(circuits[largest], effects.size(*largest))
 

@@ -177,7 +177,7 @@ def _dense(circuit: Circuit, x: Tensor, weights: dict[str, Tensor]) -> Tensor:
 
 
 def _distance(factory: Any, circuit: Circuit, options: Any, reverse: bool = False) -> float:
-    """Return how far a backend's values are from those of dense matrices."""
+    """Return the largest distance of a backend's values from dense matrices' values."""
     x, weights, _ = sample(circuit, batch=3)
     expected = _dense(circuit, x, weights)
     got = factory(circuit, options)(x, weights).detach()

@@ -40,7 +40,7 @@ def every_gate(mean_field: bool = False) -> Circuit:
 
 
 def small() -> Circuit:
-    """Return a circuit of two qubits, for what takes long."""
+    """Return a circuit of two qubits, for slow checks."""
     circuit = Circuit(2)
     weights = circuit.parameter("weights", (2,))
     for q in range(2):

@@ -39,7 +39,7 @@ class Subject:
     settings: Mapping[str, Any]
 
     def references(self) -> dict[str, str]:
-        """Return the references of the spec by field; those inside of a field have its name and a dot in front."""
+        """Return the references of the spec by field; references inside a field are called `FIELD.NAME`."""
         references = {field: getattr(self.spec, field, None) for field in REFERENCES}
         if isinstance(self.spec, specs.EnvironmentSpec):
             references |= {f"policies.{name}": reference for name, reference in self.spec.policies.items()}
@@ -82,7 +82,7 @@ class Subject:
         return counting
 
     def missing(self) -> str:
-        """Return what to type for packages that it needs and that are not installed; `""` where all are there."""
+        """Return the commands that install missing packages; `""` if none is missing."""
         extras: dict[str, str] = getattr(self.spec, "extras", {})
         return " and ".join(sorted({c for m, c in extras.items() if importlib.util.find_spec(m) is None}))
 
@@ -90,7 +90,7 @@ class Subject:
 def subject(
     kind: type[specs.Spec], name_or_spec: str | specs.Spec, settings: Mapping[str, Any] | None = None
 ) -> Subject:
-    """Look up what is to be checked.
+    """Look up the thing to check.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ def _options(subject: Subject) -> None:
 
 
 def _stored(subject: Subject, cls: type[Any], options: Any) -> None:
-    """Require that options can be stored, and read again as what they were."""
+    """Require that options can be stored, and read again unchanged."""
     for name in option_values.field_names(cls):
         require(
             not _has_set(getattr(options, name)),

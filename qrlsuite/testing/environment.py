@@ -31,7 +31,7 @@ def check(subject: Subject, deterministic: bool = False) -> list[Finding]:
     Parameters
     ----------
     deterministic:
-        Whether all episodes are meant to be alike, whatever the seed.
+        Whether all episodes are meant to be equal, whatever the seed.
     """
     lanes = Lanes(subject)
     rules = Checklist()

@@ -22,7 +22,7 @@ class Finding:
     ok:
         Whether it holds.
     message:
-        Where it holds: what was looked at. Where it does not: what is wrong, and the likely cause.
+        The tested facts if the rule holds; else the fault, and its likely cause.
     """
 
     rule: str
@@ -31,7 +31,7 @@ class Finding:
 
 
 class BrokenRuleError(Exception):
-    """A rule does not hold; the message says what is wrong and the likely cause."""
+    """A rule does not hold; the message names the fault and its likely cause."""
 
 
 def require(holds: bool, message: str) -> None:

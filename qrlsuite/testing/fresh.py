@@ -68,7 +68,7 @@ def _plugins() -> list[str]:
 
 
 def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
-    """Do what `fresh_process` says, in this process."""
+    """Do the work of `fresh_process` in this process."""
     failed: dict[str, str] = {}
     for name in modules:
         try:

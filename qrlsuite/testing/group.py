@@ -68,7 +68,7 @@ class Toy(LaneEnv):
         return np.column_stack([shown, self.kept[:, 0] / 10]).astype(np.float32)
 
     def masks(self) -> dict[str, Any]:
-        """Return infos with what can be chosen now (L, actions); nothing without `masked`."""
+        """Return infos with the mask of allowed actions (L, actions); empty without `masked`."""
         forbidden = (self.kept[:, 2] + 1 + self.kept[:, 0] % 2) % ACTIONS
         return {"action_mask": forbidden[:, None] != np.arange(ACTIONS)} if self.masked else {}
 
@@ -222,7 +222,7 @@ class _Remembering(nn.Module):
         self.layer = _Linear(outputs, 2 * inputs, generators)
 
     def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
-        """Map (S, B, inputs), and what is remembered (S, B, inputs), to (S, B, outputs) and what is remembered."""
+        """Map (S, B, inputs) and a memory (S, B, inputs) to (S, B, outputs) and the next memory."""
         before = torch.zeros_like(x) if state is None else state
         after = 0.5 * before + 0.5 * x
         outputs = self.layer(torch.cat([x, before], 2))
@@ -291,14 +291,14 @@ class ToyGroup:
         begins: NDArray[np.bool_] | None = None,
         infos: Mapping[str, Any] = NOTHING,
     ) -> NDArray[Any]:
-        """Return the greedy actions on observations (S, B, inputs), the fixed ones where none are given.
+        """Return the greedy actions on observations (S, B, inputs), by default on the fixed ones.
 
         Parameters
         ----------
         begins:
             Where episodes begin (S, B), for an algorithm that asks; None: everywhere.
         infos:
-            What lanes say of the observations, for an algorithm that asks.
+            The lanes' infos on the observations, for an algorithm that asks for them.
         """
         seen = self.look() if observations is None else observations
         more: tuple[Any, ...] = ()
@@ -328,7 +328,7 @@ class ToyGroup:
         return saved
 
     def load(self, saved: Mapping[str, NDArray[Any]]) -> ToyGroup:
-        """Restore what `save` returned, or slices of it."""
+        """Restore a result of `save`, or slices of it."""
         lanes = len(self.seeds) * E
         self.envs.seed_lanes(unpack(saved["streams"].reshape(lanes, -1)))
         self.envs.load_state_dict(
@@ -349,7 +349,7 @@ class ToyGroup:
 
 
 def array(value: Any) -> NDArray[Any]:
-    """Copy what an algorithm returned, whatever it is."""
+    """Copy an algorithm's result of any type."""
     return np.array(value.detach().numpy() if isinstance(value, Tensor) else value)
 
 

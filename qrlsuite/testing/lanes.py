@@ -23,7 +23,7 @@ LONGEST = 10_000
 """Steps within which an episode must end."""
 
 Seen = dict[str, NDArray[Any]]
-"""What lanes showed, lane-first: `observations`, `rewards`, `terminated`, `truncated` and `scores`, NaN where none."""
+"""Outputs of lanes, lane-first: `observations`, `rewards`, `terminated`, `truncated`, and `scores` (NaN for none)."""
 
 
 class Lanes:
@@ -68,12 +68,12 @@ def register(spec: specs.EnvironmentSpec) -> None:
 
 
 def rows(seeds: Sequence[int]) -> list[int]:
-    """Return the lanes of seeds, among those of all."""
+    """Return the lanes of some seeds among the lanes of all."""
     return [s * E + e for s in seeds for e in range(E)]
 
 
 def actions(seeds: Sequence[int], space: gymnasium.Space[Any], steps: int) -> NDArray[Any]:
-    """Return every lane's actions (steps, 2 len(seeds), ...); those of a seed do not depend on the others."""
+    """Return every lane's actions (steps, 2 len(seeds), ...); a seed's actions do not depend on other seeds."""
     columns = [draw(space, np.random.Generator(np.random.Philox(key=77 + s)), steps, E) for s in seeds]
     return np.concatenate(columns, axis=1)
 
@@ -109,7 +109,7 @@ def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
 
 
 def first_episodes(seen: Seen) -> list[Seen]:
-    """Return what every lane showed in its first episode, without the observation that follows its last step."""
+    """Return every lane's first episode, without the observation that follows its last step."""
     episodes = []
     for lane, ended in enumerate(seen["terminated"] | seen["truncated"]):
         length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)

@@ -27,9 +27,9 @@ from qrlsuite.training.trainer import build_agent, observed_space
 
 OUT, B, S = 3, 6, 5
 FLAT, IMAGE = Box(-1.0, 1.0, (4,)), Box(0.0, 1.0, (10, 9, 2))
-"""What models observe here; the image those that ask for the space."""
+"""Observation spaces here: flat, and an image for models that ask for the space."""
 ODD = 5
-"""Units of a layer, and what else an option counts, for which vectors of the processor leave a rest."""
+"""A number of units (or other counts in options) that no vector of the processor divides."""
 BATCHES = (B, 1, 3, 7, 13)
 
 
@@ -88,13 +88,13 @@ class Subjects:
         return build_agent(self.build, self.inputs, OUT, options, generator, self.space)
 
     def x(self, *lead: int, seed: int = 0, batch: int = B) -> Tensor:
-        """Return inputs (*lead, batch, inputs), and what is remembered behind them."""
+        """Return inputs (*lead, batch, inputs) with the memory behind them."""
         size = self.inputs + self.remembered
         drawn = torch.rand(*lead, batch, size, generator=torch.Generator().manual_seed(seed))
         return drawn * 2 - 1
 
     def population(self, seeds: Sequence[int], options: Sequence[Any] | None = None) -> nn.Module:
-        """Return a population of freshly built agents, each with options of its own where these are given."""
+        """Return a population of freshly built agents, each with its own options if given."""
         own = [self.options] * len(seeds) if options is None else options
         agents = [self._raw(*each) for each in zip(seeds, own)]
         if self.spec.population is None:

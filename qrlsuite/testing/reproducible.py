@@ -43,7 +43,7 @@ def different_seed(lanes: Lanes, steps: int) -> None:
 
 
 def seed_independence(lanes: Lanes, steps: int) -> None:
-    """Seeds alone, in pairs and shuffled see what they see among all."""
+    """Seeds alone, in pairs and shuffled see the same as among all seeds."""
     envs = lanes.make(range(S))
     space = envs.single_action_space
     whole = play(envs, actions(range(S), space, steps))

@@ -71,7 +71,7 @@ def of_distribution(distribution: str) -> list[CheckTarget]:
 
 
 def _of_kind(kind: str, name: str) -> list[CheckTarget]:
-    """Return what `KIND:NAME` stands for."""
+    """Return the targets of `KIND:NAME`."""
     if kind == "distribution":
         distribution = _distribution(name)
         if distribution is None:
@@ -96,6 +96,6 @@ def _distributions() -> set[str]:
 
 
 def _distribution(name: str) -> str | None:
-    """Return the distribution of that name, spelled as it is; `_`, `-`, `.` and case are alike, as they are to pip."""
+    """Return the distribution of that name, in its own spelling; `_`, `-`, `.` and case do not matter, as in pip."""
     names = {canonical(each): each for each in sorted(_distributions(), reverse=True)}
     return name if name in _distributions() else names.get(canonical(name))

@@ -67,7 +67,7 @@ def _speeds(spec: specs.StudySpec) -> None:
 
 
 def _show(spec: specs.StudySpec) -> None:
-    """Have the command show the file: what pictures there are is known to the part that draws them."""
+    """Let the command show the file: only the drawing part knows the kinds of pictures."""
     command = [sys.executable, "-W", "ignore", "-m", "qrlsuite", "show", "study", spec.path, "--json"]
     with tempfile.TemporaryDirectory() as runs:
         done = subprocess.run(

@@ -17,7 +17,7 @@ FileSpec = specs.TaskSpec | specs.StudySpec
 
 @contextlib.contextmanager
 def in_its_words() -> Iterator[None]:
-    """Let the suite's own errors say what is broken: they name the place and the remedy."""
+    """Turn the suite's own errors into broken rules: they name the place and the remedy."""
     try:
         yield
     except QrlSuiteError as error:
@@ -43,9 +43,9 @@ def check_format(
     Parameters
     ----------
     valid:
-        What holds for a file that is.
+        Statement about a valid file.
     cause:
-        Of errors that are not the suite's own.
+        Likely cause of errors that are not the suite's own.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def check_names(rules: Checklist, spec: FileSpec, name: str, summary: str, other
     name, summary:
         As the file has them.
     otherwise:
-        What another name would lead to.
+        Consequence of another name.
     """
     rules.run(
         "says what is registered",

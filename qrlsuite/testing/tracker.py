@@ -73,7 +73,7 @@ def _sent(trackers: list[Any], folder: Path) -> None:
 
 
 def _a_run(send: Callable[..., None], folder: Path) -> None:
-    """Send what two seeds' runs send: two epochs, the second of them again after resuming."""
+    """Send the events of two seeds' runs: two epochs, and the second again after resuming."""
     runs = []
     for seed in (7, 8):
         seed_folder = folder / f"seed-{seed:04d}"

@@ -2,8 +2,8 @@
 on a device.
 
 Finished rounds of episodes are kept in the entry's folder, so that an evaluation that was stopped, or that a device
-ended half-way, goes on where it was. Sampling is keyed by the evaluation's seed and the round, not by what was played
-before: an evaluation in two parts ends with the numbers of one in a single go.
+ended half-way, goes on where it was. Sampling is keyed by the evaluation's seed and the round, not by earlier play: an
+evaluation in two parts ends with the same numbers as in one go.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
 
 @dataclass(frozen=True)
 class Cost:
-    """What an evaluation on a backend takes.
+    """The cost of an evaluation on a backend.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Cost:
     shots:
         Repetitions of each; None where the backend computes expectation values exactly.
     terms:
-        What the device says of that many.
+        The device's terms for that many executions.
     kept:
         Episodes of each agent that were played before.
     """
@@ -163,11 +163,11 @@ class Deployment:
         return trained_agents(self.entry, self._store, self.seeds, self._device)
 
     def kept(self, seed: int) -> Kept:
-        """Return the rounds that are kept of the evaluation with a seed."""
+        """Return the stored rounds of the evaluation with a seed."""
         return Kept(self.folder, {**self._description, "evaluation_seed": seed})
 
     def cost(self, episodes: int, seed: int, steps: float) -> Cost:
-        """Return what is still to be executed, at a mean number of steps per episode."""
+        """Return the remaining executions, at a mean number of steps per episode."""
         lanes = min(LANES, episodes)
         rounds = -(-episodes // lanes)
         done = sum(1 for block in range(rounds) if self.kept(seed).get(block, lanes) is not None)
@@ -176,7 +176,7 @@ class Deployment:
         return Cost(len(self.seeds), episodes, kept, circuits, self.shots, self._terms(circuits))
 
     def play(self, episodes: int, seed: int, report: Report = lambda name, done, total: None) -> Played:
-        """Play episodes, those of `qrlsuite.training.evaluation.trained`; finished rounds are kept."""
+        """Play the episodes of `qrlsuite.training.evaluation.trained`; finished rounds are stored."""
         streams = Streams(self.entry.task.hash, seed)
         progress = [0]
 
@@ -213,7 +213,7 @@ class Kept:
     Attributes
     ----------
     path:
-        The file: named by the hash of what it holds, which its first line says.
+        The file, named by the hash of the description in its first line.
     """
 
     def __init__(self, folder: Path, description: Mapping[str, Any]) -> None:

@@ -1,11 +1,11 @@
-"""What can be said about trained agents, beside the same agents before training.
+"""Diagnostics of trained agents, beside the same agents before training.
 
-Trained agents play, and what their networks are given at every step is kept. At these inputs both networks are looked
-at: trained, and with their initial parameters.
+Trained agents play, and their networks' inputs at every step are stored. At these inputs both networks are examined:
+trained, and with their initial parameters.
 
-- Fisher information of the parameters that learn, see `qrlsuite.diagnostics.fisher`: of the policy, if the algorithm
-  says by `information` what its network's outputs stand for, else of values;
-- spectrum of the outputs along each input, over the range that was visited, see `qrlsuite.diagnostics.fourier`;
+- Fisher information of the trainable parameters, see `qrlsuite.diagnostics.fisher`: of the policy, if the algorithm
+  defines `information` of its network's outputs, else of values;
+- spectrum of the outputs along each input, over the visited range, see `qrlsuite.diagnostics.fourier`;
 - entanglement of the circuits' states, see `qrlsuite.diagnostics.states`.
 
 Circuits are computed exactly, by the native simulator, whatever they were trained with.
@@ -52,7 +52,7 @@ Report = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What P agents are, by their parameters: `trained` and `initial`.
+    """Diagnostics of P agents with `trained` and `initial` parameters.
 
     Attributes
     ----------
@@ -61,16 +61,16 @@ class Diagnosis:
     seeds:
         Seeds of the agents.
     outputs:
-        `policy` where the Fisher information is that of the policy, else `values`: Gaussians of unit variance.
+        `policy` if the Fisher information is of the policy, else `values`: Gaussians of unit variance.
     shapes:
-        Of each of the network's parameters that learn, of one agent.
+        Shapes of one agent's trainable parameters.
     information:
-        Of each agent; empty for a network that remembers, whose outputs depend on more than its input.
+        Fisher information of each agent; empty for a network that remembers: its outputs depend on more than its input.
     powers:
         Of each agent (P, F), at 1, 2, ... waves in the range of an input that was visited, mean over inputs and outputs
         of each agent's network; empty for a network that remembers.
     qubits:
-        Of the circuit; None without one, or where it drops all correlations.
+        Qubits of the circuit; None without a circuit, or if it drops all correlations.
     steps:
         Steps (K,) of the episodes at which states were measured.
     entanglement:
@@ -147,11 +147,11 @@ def along_episodes(
     Parameters
     ----------
     best, seed, device, on:
-        As for `qrlsuite.training.evaluation.trained`; the episodes are the first of those.
+        As for `qrlsuite.training.evaluation.trained`; the episodes are its first ones.
     episodes:
         Episodes of each agent.
     report:
-        Called with what is computed, and how far it is.
+        Called with the name of the computation and its progress.
     """
     entry = evaluation.trained_entry(store, on)
     if getattr(entry.model_options, "backend", None) is not None:
@@ -200,7 +200,7 @@ def along_episodes(
 def _play(
     entry: Entry, agents: Trainer, count: int, episodes: int, seed: int
 ) -> tuple[list[Tensor], NDArray[np.int64]]:
-    """Return what the policy network was given at every step, each (P, E, in), and the episodes' lengths (P, E)."""
+    """Return the policy network's inputs at every step, each (P, E, in), and the episodes' lengths (P, E)."""
     if episodes < 1:
         raise OptionError(f"--episodes {episodes}: at least one is needed")
     streams = Streams(entry.task.hash, seed)

@@ -105,8 +105,8 @@ def distribution(values: FloatArray) -> dict[str, float]:
 def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], int]:
     """Choose the runs with the best last validation score, earlier seeds first where equal.
 
-    Only finished runs count, of these only those with the most epochs that any has, and of these, if any have
-    agents, only these: an entry may have been imported with some.
+    Only finished runs with the largest number of epochs count; and if some of them have agents, only those runs: an
+    entry may have been imported with some agents.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
 
 
 def require_fitting(trainer: Trainer, agent: Mapping[str, NDArray[Any]], path: Path) -> None:
-    """Refuse trained parameters that are not those of a trainer's agents."""
+    """Refuse trained parameters that do not fit a trainer's agents."""
     problem = _misfit({name: value[0] for name, value in _state(trainer).items()}, agent)
     if problem:
         raise StoreError(f"{path} does not fit the entry's model: {problem}")
@@ -250,8 +250,8 @@ def trained(
     Parameters
     ----------
     best:
-        How many runs: those with the best last *validation* score. The evaluation's episodes are others, so
-        its mean is not raised by the choice.
+        Number of runs, chosen by the best last *validation* score. The evaluation has other episodes, so the choice
+        does not raise its mean.
     episodes:
         Complete episodes of each agent.
     seed:
@@ -280,7 +280,7 @@ def trained(
 
 
 def _perturbing(agents: Trainer, scale: float, streams: Streams) -> Callable[[int], None]:
-    """Return what perturbs the trained numbers of agents, by a relative size, anew for a round of episodes."""
+    """Return a function that perturbs the agents' trained numbers by a relative size, anew for each round."""
     learned = {p.data_ptr() for model in agents.models.built for p in model.parameters() if p.requires_grad}
     state = agents.algorithm.policy_state()
     tensors = [state[name].detach() for name in sorted(state) if state[name].data_ptr() in learned]
@@ -350,7 +350,7 @@ class Round(NamedTuple):
 
 
 class KeptRounds(Protocol):
-    """Where finished rounds are kept, by number and lanes."""
+    """A store of finished rounds, by number and lanes."""
 
     def get(self, block: int, lanes: int) -> Round | None:
         """Return a round that was finished before."""
@@ -419,6 +419,6 @@ def play(
 
 
 def knows_scores(entry: Entry) -> bool:
-    """Return whether what the entry's task ranks is another number than an episode's return."""
+    """Return whether the entry's task ranks another number than an episode's return."""
     section = entry.task.file.score
     return section.source == "info" or section.max_return is not None

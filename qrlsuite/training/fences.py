@@ -47,7 +47,7 @@ def _moved(before: tuple[Any, Any, torch.Tensor], others_draw: bool) -> list[str
 
 
 def _other_threads() -> bool:
-    """Tell whether there are threads that are not the suite's own: a tracker's, or those of a Dask worker."""
+    """Return whether other threads than the suite's run: a tracker's, or a Dask worker's."""
     main = threading.main_thread()
     return any(thread is not main and thread.name != HEARTBEAT_THREAD for thread in threading.enumerate())
 
@@ -91,9 +91,9 @@ class Fence:
         Parameters
         ----------
         call:
-            What is called, for the message: `model 'waves', forward`.
+            Name of the call, for the message: `model 'waves', forward`.
         fine:
-            Whether it is one of many, of which the first are watched.
+            Whether it is one of many calls; only the first of them are watched.
         """
         if not self.closed:
             return _OPEN
@@ -120,7 +120,7 @@ class Fence:
         module.register_forward_hook(end)
 
     def _hooks(self, call: str) -> tuple[Callable[..., None], Callable[..., None]]:
-        """Return what is called before and after a pass; plain functions, for a deep copy copies a method's object."""
+        """Return the hooks before and after a pass; plain functions, since a deep copy would copy a method's object."""
         entered: list[contextlib.AbstractContextManager[None]] = []
 
         def begin(module: torch.nn.Module, inputs: Any) -> None:

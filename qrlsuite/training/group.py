@@ -1,7 +1,7 @@
 """Trains one group of seeds epoch by epoch, and writes records and checkpoints to the folder of each one's entry.
 
-Killed at any moment and resumed, a group ends with the same curves and parameters, byte for byte, as one never
-stopped: lines newer than the checkpoint are cut. `qrlsuite.training.trainer` trains; here is what is on disk of it.
+Killed at any moment and resumed, a group ends with the same curves and parameters, byte for byte, as a group that
+never stopped: lines newer than the checkpoint are cut. `qrlsuite.training.trainer` trains; this module has its files.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class GroupProbe(Protocol):
         """Add an epoch; returns whether `judge` can be called."""
 
     def judge(self) -> dict[str, Any]:
-        """Return what `run.json` stores under `probe`."""
+        """Return the value of `probe` in `run.json`."""
 
 
 def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
-    """Return what is recorded of an epoch, one line of `epochs.jsonl` for each seed, as plain values."""
+    """Return the record of an epoch as plain values: one line of `epochs.jsonl` for each seed."""
     lines = []
     for s, scores in enumerate(epoch.scores):
         line: dict[str, Any] = {"epoch": epoch.number, "scores": store.shortest(scores)}
@@ -72,11 +72,11 @@ class GroupFiles:
     Parameters
     ----------
     entry, entry_store:
-        What is trained, and its folder.
+        The entry to train, and its folder.
     seeds:
         Protocol seeds; all at the same epoch.
     events:
-        The trackers that are told.
+        The trackers to notify.
     code:
         The identity of the code that trains.
     """
@@ -95,9 +95,9 @@ class GroupFiles:
         self.saved_epoch = 0
 
     def resume(self) -> tuple[int, checkpoint.Arrays]:
-        """Return the epoch and the state of the newest checkpoint; cut what is newer.
+        """Return the epoch and the state of the newest checkpoint; cut newer lines.
 
-        Without one, the epoch is 0, and the state what `Trainer.start` takes: nothing, or the agents to begin with.
+        Without a checkpoint, the epoch is 0, and the state an argument of `Trainer.start`: empty, or first agents.
         """
         epoch, arrays = checkpoint.load(self.store, self.seeds)
         for seed in self.seeds:
@@ -246,7 +246,7 @@ class GroupRun:
     Parameters
     ----------
     entry, entry_store:
-        What to run, and its folder.
+        The entry to run, and its folder.
     seeds:
         Protocol seeds; all at the same epoch.
     epochs:
@@ -256,12 +256,12 @@ class GroupRun:
     report:
         Called after every round with the group's progress.
     others:
-        Folders of further entries, each with the seeds of it that are at this epoch too: they are trained in the same
-        population, and left as if each had been trained alone.
+        Folders of further entries, each with its seeds at this epoch: they are trained in the same population, with the
+        results of separate training.
     held:
         Whether the seeds are still this process's own; nothing is written any more once they are not.
     probe:
-        Of the middle seed of the population; None for none.
+        The probe of the population's middle seed, or None.
 
     Attributes
     ----------
@@ -366,7 +366,7 @@ class GroupRun:
             self.trainer.models.compile_circuits()
 
     def _judge(self, guard: Interruptible, probe: GroupProbe) -> None:
-        """Make the probe, and note what it found; an interruption ends it, and the same command makes it again."""
+        """Make the probe, and record its result; an interruption ends it, and the same command makes it again."""
         self.progress.phase = "probing"
         self.report(self.progress)
         found = probe.judge()
@@ -390,7 +390,7 @@ class GroupRun:
         self.report(self.progress)
 
     def _require_held(self) -> None:
-        """Refuse to write what is another worker's by now."""
+        """Refuse to write seeds that another worker has taken over."""
         if not self.held():
             raise StoreError(
                 "another worker has taken these seeds over, and goes on from their last checkpoint: nothing more is "

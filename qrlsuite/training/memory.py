@@ -1,8 +1,7 @@
 """Checks, before training, that the groups fit into memory.
 
-Only what models and algorithms say of themselves is counted (`memory` of their specs); what they do not say is unknown.
-What is refused does therefore not fit; what is let through may still be large (an environment's own memory, long
-observations, a model that says nothing).
+Only the memory stated in the specs of models and algorithms is counted (`memory`). A refused group therefore does not
+fit; an accepted group may still be too large (the environment's memory, long observations, a model without `memory`).
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ PROCESS = 300 << 20
 """Bytes of a process that has imported torch."""
 
 COPIES = 3
-"""Of what is saved: the training's own, the snapshot of the last epoch, and the next one while it is made."""
+"""Copies of the saved state: the training's own, the snapshot of the last epoch, and the next one in the making."""
 
 
 def group_bytes(entry: Entry, seeds: int) -> int:
     """Return the bytes that a group of `seeds` needs in its process, at least.
 
-    What the algorithm saves is there three times, for checkpoints, and the parameters once more as gradients.
+    The algorithm's saved state counts three times, for checkpoints, and the parameters once more as gradients.
     """
     kept = algorithm_memory(entry.algorithm, entry.algorithm_options, entry.task.file.protocol.rounds)
     model = model_bytes(entry.model, entry.model_options, seeds, kept.batch, kept.networks * COPIES + 1)
@@ -41,7 +40,7 @@ def group_bytes(entry: Entry, seeds: int) -> int:
 
 
 def algorithm_memory(spec: specs.AlgorithmSpec, options: Any, rounds: int) -> Memory:
-    """Return what an algorithm's spec says that an agent keeps, the least that any keeps where it says nothing."""
+    """Return an agent's memory by its algorithm's spec, or the least of any algorithm if the spec states none."""
     from qrlsuite.algorithm import Memory  # imports torch
 
     if spec.memory is None:
@@ -80,7 +79,7 @@ def _wrong(spec: specs.AlgorithmSpec | specs.ModelSpec, problem: str) -> PluginE
 
 
 def available(meminfo: Path = Path("/proc/meminfo")) -> int | None:
-    """Return the bytes that new processes can have; all of the machine's where only that is known, None without it."""
+    """Return the bytes for new processes; the machine's whole memory if only that is known; None if unknown."""
     try:
         for line in meminfo.read_text().splitlines():
             name, _, value = line.partition(":")

@@ -196,7 +196,7 @@ class MeteredEnv(LaneEnv):
         return {**self.inner.state_dict(), "metered.returns": self.returns}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.inner.load_state_dict({k: v for k, v in state.items() if k != "metered.returns"})
         self.returns = np.array(state["metered.returns"])
 

@@ -6,8 +6,8 @@ and wherever it is worked on.
 
 Of a task:
 
-    token           of this task alone: its answer has the same
-    entry           what is trained, as `entry.json` has it
+    token           unique to the task; repeated in its answer
+    entry           the entry to train, as in `entry.json`
     seeds, epoch    the group, and the epoch of the checkpoint; at epoch 0 there is none, or the agents to begin with
     epochs          where to stop
     seconds         how long to train; one epoch is trained at least
@@ -60,7 +60,7 @@ MOST_BYTES = 32 << 20
 """The largest task or answer: what a queue's connections and memory take without trouble."""
 
 _one_at_a_time = threading.Lock()
-"""Held while training: torch's number of threads and a worker's memory are meant for one group."""
+"""Locked while training: torch's number of threads and a worker's memory are meant for one group."""
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # <malloc.h>
 
@@ -102,7 +102,7 @@ def differing(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
 
 
 def work_on(task: bytes) -> bytes:
-    """Work on a task; returns the answer, and never raises what the training raises."""
+    """Work on a task; return the answer, and never raise an error of the training."""
     try:
         header, arrays = unpack(task)
         needed = dict(header["versions"])
@@ -130,7 +130,7 @@ def work_on(task: bytes) -> bytes:
 
 
 def _load_plugins(packed: Sequence[Any]) -> None:
-    """Load the plugins by path that a task has, in the place of those of earlier tasks; the same again does nothing."""
+    """Load a task's plugins by path, and unload plugins of earlier tasks; loaded plugins of the task stay."""
     folder = Path(_folder().name)
     sources = [own.Source.unpacked(each, folder) for each in packed]
     for each in own.loaded():
@@ -148,7 +148,7 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def _changed_code(header: Mapping[str, Any]) -> str:
-    """Say in what the code here differs from what a task is to be trained with; nothing where it does not."""
+    """Name the differences between the code here and a task's code; empty if there are none."""
     try:
         sent = [dict(part) for part in header["code"]]
         return listed(
@@ -177,7 +177,7 @@ def keep_freed_memory() -> None:
 
 
 def too_large(size: int, seeds: int) -> str:
-    """Say that what would be sent is too large."""
+    """Return the error text for a checkpoint that is too large to send."""
     least = f"{size / 2**20:.0f} MB for {seeds} seed{'s' * (seeds > 1)}"
     return (
         f"a checkpoint is too large to be sent: {least}, and at most {MOST_BYTES >> 20} are; an engine with a shared "

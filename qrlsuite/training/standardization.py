@@ -1,4 +1,4 @@
-"""Running statistics: every agent standardizes observations by the mean and variance of those it has trained on.
+"""Running statistics: every agent standardizes observations by mean and variance of its training observations.
 
 Where an environment asks for it (`LaneEnv.running_statistics`, the option `normalization = "running"`), an agent with
 mean m and variance v of each observed value sees
@@ -9,19 +9,19 @@ in place of the observation x, in all of its networks. The constants are those o
 Gymnasium's `NormalizeObservation` does not clip.
 
 - *Whose.* Statistics belong to a seed. They are gathered from every observation that a step of its training
-  environments returns: after an episode's end the next one's first, so that each is one to act on. Validation and
-  evaluation use them and leave them as they are.
+  environments returns: after an episode's end the next episode's first, so that each is an observation to act on.
+  Validation and evaluation use the statistics without changing them.
 - *When.* Networks use the statistics of all epochs before the current one: they stand still while an epoch is
-  collected, learned from and validated. Log-probabilities of a rollout are thus exactly those of the policy that
-  acted, which wrappers that move with every step achieve only by storing what they made of each observation. OpenAI
-  Baselines' PPO and TRPO update once per rollout too. The first epoch has no statistics: m = 0, v = 1.
+  collected, learned from and validated. Log-probabilities of a rollout thus belong exactly to the policy that acted;
+  wrappers that update with every step reach that only by storing each standardized observation. OpenAI Baselines' PPO
+  and TRPO update once per rollout too. The first epoch has no statistics: m = 0, v = 1.
 - *Where.* Before the first layer of each network, not in the environment. Rollouts, unfinished episodes and the
-  replay buffer hold raw observations and are standardized when they are used, old ones by today's statistics; so is
-  what a target network is given. An algorithm needs to know nothing of it.
+  replay buffer hold raw observations, which are standardized when used, old ones by the current statistics; the same
+  holds for inputs of a target network. An algorithm needs to know nothing of it.
 
-Mean and variance come from Welford's update in float64 for each training environment by itself (Welford 1962), and
-those of a seed's environments are merged in their order (Chan, Golub & LeVeque 1983): elementwise operations only, so
-that no seed depends on its company in any bit. A circuit's model gets the same z as any other; it lies in [-10, 10],
+Mean and variance come from Welford's update in float64 for each training environment by itself (Welford 1962). A
+seed's environments are merged in their order (Chan, Golub & LeVeque 1983): elementwise operations only, so that no
+seed depends on its company in any bit. A circuit's model gets the same z as any other; it lies in [-10, 10],
 not within one period of a rotation, and most of it in [-3, 3].
 """
 
@@ -38,7 +38,7 @@ from torch import Tensor, nn
 CLIP = 10.0
 EPSILON = 1e-8
 PREFIX = "observation_statistics."
-"""What the names of statistics begin with among an agent's parameters and in a checkpoint."""
+"""Prefix of the statistics' names among an agent's parameters and in a checkpoint."""
 
 Floats = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class RunningStatistics:
     mean, squares:
         Their mean, and the sum of squared deviations from it (S * E, n).
     used:
-        What the networks standardize by: `count` (S,) int64, `mean` and `variance` (S, n) float64.
+        The statistics in use: `count` (S,) int64, `mean` and `variance` (S, n) float64.
     """
 
     def __init__(self, seeds: int, environments: int, size: int, device: torch.device) -> None:
@@ -75,7 +75,7 @@ class RunningStatistics:
         self.refresh()
 
     def attach(self, population: nn.Module) -> None:
-        """Let a population (S, B, n) -> (S, B, out), and every copy of it, standardize what it is given."""
+        """Let a population (S, B, n) -> (S, B, out), and every copy of it, standardize its inputs."""
         population.register_forward_pre_hook(self)
 
     def __call__(self, population: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -120,13 +120,13 @@ class RunningStatistics:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take over what has been written into `used`."""
+        """Compute mean and deviation from the values in `used`."""
         deviation = (self.used["variance"] + EPSILON).sqrt()
         self._mean = self.used["mean"][:, None].to(torch.float32).to(self.device)
         self._deviation = deviation[:, None].to(torch.float32).to(self.device)
 
     def published(self) -> dict[str, Tensor]:
-        """Return what the agents standardize by, seed-first, under names for their parameters; no copies."""
+        """Return the statistics in use, seed-first, under names for the agents' parameters; no copies."""
         return {f"{PREFIX}{name}": value for name, value in self.used.items()}
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
@@ -139,7 +139,7 @@ class RunningStatistics:
         }
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `state_dict` returned, also a group cut from or merged of others at the same epoch."""
+        """Restore a result of `state_dict`, also of a group cut from or merged of others at the same epoch."""
         self.count = int(state["count"][0])
         self.mean = state["mean"].reshape(self.mean.shape).copy()
         self.squares = state["squares"].reshape(self.squares.shape).copy()

@@ -9,7 +9,7 @@ A tracker has any of these methods, which are called in the worker that trains:
 `run` is the seed's `run.json` and its `folder`; `run_started` is given `epochs` and `history` too, the number of the
 finished epochs and their records. Epochs after a run's last checkpoint come a second time when it goes on.
 
-Trackers whose spec says `always` watch every run, others those that ask for them: workers read the environment
+Trackers whose spec says `always` watch every run, others only runs that ask for them: workers read the environment
 variable `QRLSUITE_TRACK`, which `qrlsuite run --track` sets.
 """
 
@@ -52,14 +52,14 @@ def parse(requests: Sequence[str], known: registry.Registry | None = None) -> di
 
 
 def ask(requests: Sequence[str]) -> None:
-    """Ask for trackers, in this process and in the workers that it starts; the errors are those of `parse`."""
+    """Ask for trackers, in this process and in the workers that it starts; raises the errors of `parse`."""
     parse(requests)
     os.environ[TRACK] = "\n".join(requests)
 
 
 @contextlib.contextmanager
 def asking(requests: Sequence[str]) -> Iterator[None]:
-    """Ask for trackers while something is trained; without words, for those that the environment names."""
+    """Ask for trackers during a training; without words, for the trackers that the environment names."""
     before = os.environ.get(TRACK)
     if requests:
         ask(requests)
@@ -106,7 +106,7 @@ class EventSink:
         self._trackers[name] = build(known.get(specs.TrackerSpec, name).spec, target)
 
     def heard(self, event: str) -> bool:
-        """Whether any tracker listens to an event: what it is told takes time to read."""
+        """Whether some tracker listens to an event: reading its arguments takes time."""
         return any(hasattr(tracker, event) for tracker in self._trackers.values())
 
     def send(self, event: str, **content: Any) -> None:

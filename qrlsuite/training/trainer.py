@@ -106,7 +106,7 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
 
 
 def require_trainable(entry: Entry) -> None:
-    """Refuse, by one agent that is built and not trained, what an algorithm, a model and a task cannot do together."""
+    """Refuse an algorithm, a model and a task that do not fit; one agent is built for it and not trained."""
     if entry.model.name == specs.NO_MODEL:
         require_actions(entry, build_envs(entry, 1, lambda: None).single_action_space)
         return
@@ -193,7 +193,7 @@ def build_agent(
     space: spaces.Space[Any],
     role: str = "network",
 ) -> nn.Module:
-    """Build one agent's network by `build` of a model, which is also given what it asks for: `space`, `role`."""
+    """Build one agent's network by a model's `build`, which gets `space` and `role` if it has such parameters."""
     asked = inspect.signature(build).parameters
     more = {name: value for name, value in (("space", space), ("role", role)) if name in asked}
     return build(inputs, outputs, options, generator, **more)
@@ -217,7 +217,7 @@ class Episodes:
     rounds:
         Steps that every lane made: all lanes go on until the last episode has ended.
     metrics:
-        By name, what the environment measured (lanes,), NaN where it did not.
+        Metrics of the environment by name, (lanes,); NaN where it measured none.
     """
 
     returns: Floats
@@ -228,10 +228,10 @@ class Episodes:
 
 
 def informed(policy: Policy) -> Callable[[NDArray[np.float32], NDArray[np.bool_], Infos], NDArray[Any]]:
-    """Return a policy as one of three arguments: it is given observations alone where it does not ask for more.
+    """Return a policy as a function of three arguments; a policy of one argument gets observations alone.
 
-    `policy(observations, begins, infos)` is also told in which lanes (lanes,) an episode begins with the observation,
-    and what the lanes said of it.
+    `policy(observations, begins, infos)` also gets the lanes (lanes,) in which an episode begins with the observation,
+    and the lanes' infos.
     """
     if asks_for_more(policy):
         return policy
@@ -293,7 +293,7 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
 class ModelBuilder:
     """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one.
 
-    `entry` is that of all agents, or one for each.
+    `entry` is the entry of all agents, or a list with one for each agent.
 
     With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
     refused (PluginError), see `qrlsuite.training.unregistered`. While an agent is built, the global generators have
@@ -367,8 +367,8 @@ class ModelBuilder:
     def trained(self) -> dict[str, int]:
         """Return the trainable numbers of one agent, `classical` and `quantum`, summed over its trained `networks`.
 
-        Where numbers of these networks stay as drawn, they are counted as `fixed`. A network that needs no gradients,
-        as a target network that was built here and frozen, does not count.
+        Numbers of these networks that stay as drawn are counted as `fixed`. A network that needs no gradients, such as
+        a target network that was built here and frozen, does not count.
         """
         counted = [
             numbers
@@ -385,7 +385,7 @@ class ModelBuilder:
         return [module for module in self.built if isinstance(module, CircuitModel)]
 
     def compile_circuits(self) -> None:
-        """Let models of circuits compile what their first pass would: no epoch's time, and no estimate, holds that."""
+        """Let models of circuits compile before their first pass: no epoch's time and no estimate includes that."""
         for module in self.circuits:
             module.compile_circuits()
 
@@ -417,8 +417,8 @@ class Epoch:
     scores:
         Validation scores (S, episodes).
     measured:
-        By name, the means over the validation's episodes of what the environment measures, `info["metrics"]` at their
-        ends, (S,) each; NaN where it did not.
+        Metrics of the environment by name (`info["metrics"]` at an episode's end), means over the validation's
+        episodes, (S,) each; NaN where it measured none.
     executions:
         Circuit executions of each seed by name, validation included; empty without circuits.
     seconds:
@@ -444,8 +444,8 @@ class Trainer:
     Parameters
     ----------
     entry:
-        What is trained; or S entries, one for each seed, that differ in options per agent only: their `population_key`
-        is the same.
+        The entry to train; or S entries, one for each seed, that differ in options per agent only: their
+        `population_key` is equal.
     seeds:
         S seeds, all at the same epoch. Each stands once for every entry that it is of.
     device:
@@ -496,7 +496,7 @@ class Trainer:
         self._build({})
 
     def _build(self, initial: Mapping[int, Mapping[str, torch.Tensor]]) -> None:
-        """Build networks and algorithm; `initial` has what the networks begin with, by their number."""
+        """Build networks and algorithm; `initial` has the networks' first parameters, by their number."""
         self.models = ModelBuilder(
             self._entries, self.envs, self.streams, self.statistics, self.fence, initial
         )
@@ -616,8 +616,8 @@ class Trainer:
     def validate(self, epoch: int) -> Floats:
         """Play every seed's fresh validation episodes of an epoch; returns their scores (S, V).
 
-        Circuit executions are counted by each seed's own steps, and the models' buffers, such as how many passes with
-        shots there were, are left as they were: neither depends on the company that a seed is trained in.
+        Circuit executions are counted by each seed's own steps, and the models' buffers, such as the number of passes
+        with shots, are not changed: neither depends on the other seeds of the group.
         """
         return self._validate(epoch).scores.reshape(self.S, self.V)
 
@@ -636,7 +636,7 @@ class Trainer:
 
     @own.blamed()
     def restore(self, epoch: int, arrays: Arrays) -> None:
-        """Continue after an epoch, from what `capture` returned then."""
+        """Continue after an epoch, from the result of `capture` at that epoch."""
         try:
             self.envs.inner.seed_lanes(unpack(arrays["streams"].reshape(self.S * self.E, -1)))
             lanes = {
@@ -654,7 +654,7 @@ class Trainer:
 
     @own.blamed()
     def policy(self) -> Arrays:
-        """Return the parameters of the trained agents, seed-first, by name: what is published of them."""
+        """Return the parameters of the trained agents for publication, seed-first, by name."""
         tensors = self.algorithm.policy_state()
         if self.statistics is not None:
             tensors = {**tensors, **self.statistics.published()}
@@ -709,7 +709,7 @@ class Trainer:
         begins:
             Where an episode begins with the observation (S * L,).
         infos:
-            What the lanes said of it.
+            The lanes' infos on it.
         """
         stacked = np.ascontiguousarray(observations, np.float32)
         seen = stacked.reshape(self.S, len(stacked) // self.S, -1)
@@ -735,7 +735,7 @@ class Trainer:
         return actions.reshape(len(stacked), *shape[2:])
 
     def _called(self) -> str:
-        """Name what is called in an epoch: a generator that a single call moves is said of that call, see `Fence`."""
+        """Name the parts called in an epoch; a generator that a single call moves is blamed on that call, see `Fence`."""
         entry = self.entry
         return (
             f"algorithm '{entry.algorithm.name}', or what it calls of model '{entry.model.name}' and environment "
@@ -753,7 +753,7 @@ class Trainer:
 
 
 def _by_seed(infos: Infos, seeds: int, lanes: int) -> dict[str, NDArray[Any]]:
-    """Return what lanes say of their observations (S * L, ...) by seed (S, L, ...)."""
+    """Return the lanes' infos (S * L, ...) by seed (S, L, ...)."""
     return {
         name: value.reshape(seeds, lanes, *value.shape[1:])
         for name, value in infos.items()

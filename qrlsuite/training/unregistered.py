@@ -24,7 +24,7 @@ _MODULES = "assign it to an attribute of its own, or keep several in nn.ModuleLi
 _GENERATOR = "draw what is random in `build`, and register it as a parameter or buffer"
 
 Held = dict[str, tuple[Any, str]]
-"""By where it is (`blocks[0].weight`): a copy of the value, and what to do about it."""
+"""By place (`blocks[0].weight`): a copy of the value, and the cure."""
 
 
 def held(module: nn.Module) -> Held:
@@ -97,12 +97,12 @@ def require_none(
     Parameters
     ----------
     build:
-        Builds the module of the first seed (0), and that of another (1), anew at every call.
+        Builds the module of the first seed (0) or of another seed (1), anew at every call.
     inputs:
         Number of inputs.
     stacked:
-        Whether `qrlsuite.population.stack` makes the population: `torch.vmap` hands buffers to a pass and drops what
-        it makes of them, so that a pass may change none.
+        Whether `qrlsuite.population.stack` makes the population: `torch.vmap` hands buffers to a pass and drops their
+        changes, so that a pass may change none.
     outputs:
         How many numbers a pass must return for each sample; None asks nothing of them.
     """

@@ -115,7 +115,7 @@ def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
 def _show(
     items: list[CheckTarget], settings: dict[str, Any], more: dict[str, Any]
 ) -> list[tuple[CheckTarget, list[Finding]]]:
-    """Check things one after another, with what is going on in the last line of a terminal."""
+    """Check things one after another, and show the current one in the last line of a terminal."""
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     results = []
     with console.status("") as status:
@@ -148,7 +148,7 @@ def _print(console: Any, finding: Finding) -> None:
 
 
 def _teach(json_output: bool) -> None:
-    """Say what can be checked here."""
+    """Print the names that can be checked here."""
     known = registry.load()
     others = sorted({plugin.distribution for plugin in known.plugins} - {"qrlsuite"})
     if json_output:

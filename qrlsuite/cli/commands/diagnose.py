@@ -1,4 +1,4 @@
-"""`qrlsuite diagnose`: what can be said about a circuit, or about trained agents, with tables and a picture."""
+"""`qrlsuite diagnose`: diagnostics of a circuit, or of trained agents, with tables and a picture."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def export(
 
 
 def shortfalls(entry: EntryResults) -> Iterator[str]:
-    """Say what keeps an entry from a public board's ranks, or from being checked there."""
+    """Return the reasons why a public board would not rank an entry, or could not check it."""
     protocol, epochs = entry.task_file.protocol, entry.curves.shape[1]
     whole = protocol.algorithm_epochs.get(entry.algorithm, protocol.epochs)
     if len(entry.seeds) < protocol.seeds or epochs < whole:

@@ -57,7 +57,7 @@ def list_things(
 
 
 def _published_studies() -> list[dict[str, str]]:
-    """Return the studies with looks that come with the suite; like a task, each is known by its file alone."""
+    """Return the studies with looks that come with the suite; each is listed by its file."""
     from qrlsuite.leaderboard.shelf import PLANS
     from qrlsuite.studies.study import load
 
@@ -117,7 +117,7 @@ def _origin(row: dict[str, str]) -> str:
 
 
 def _folded(things: list[tuple[str, str]], command: str) -> list[tuple[str, str]]:
-    """Make a line of the many variants of a thing: of those whose name goes on after that thing's and a hyphen."""
+    """Fold the many variants of a thing, named with its name and a hyphen, into one line."""
     names = [name for name, _ in things]
     variants = {name: [each for each in names if each.startswith(f"{name}-")] for name in names}
     many = {name: found for name, found in variants.items() if len(found) >= MANY}

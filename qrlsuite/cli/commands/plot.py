@@ -1,4 +1,4 @@
-"""`qrlsuite plot`: pictures of what was trained, of a task's environment, and of the estimator."""
+"""`qrlsuite plot`: pictures of results, of a task's environment, and of the estimator."""
 
 from __future__ import annotations
 

@@ -166,7 +166,7 @@ def _of_its_size(circuit: Entry, task: str, written: Written, words: list[str], 
 
 
 def _written(words: list[str], model: str | None, settings: list[str], quick: bool) -> Written:
-    """Read the entry, given as arguments or by --model, and what --set and --quick add."""
+    """Read the entry from arguments or --model, and add the settings of --set and --quick."""
     if model is not None and not split_settings(words)[0]:
         words, model = [model, *words], None
     if not words or model is not None:

@@ -1,4 +1,4 @@
-"""`qrlsuite runs`: what the results folder holds and how far it is; `runs gc` and `runs rm` remove parts of it."""
+"""`qrlsuite runs`: content and progress of the results folder; `runs gc` and `runs rm` remove parts of it."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ def _changes(words: list[str] | None) -> tuple[dict[str, Any], dict[str, str], l
 
 
 def _report(name: str, outcome: StudyOutcome, budget: str | None, runs: Path, json_output: bool) -> None:
-    """Say what a study with looks has come to, and what to type next."""
+    """Print the outcome of a study with looks, and the next command."""
     if json_output:
         typer.echo(json.dumps(outcome.as_dict()))
         return

@@ -34,7 +34,7 @@ MUCH = 1_000_000_000
 
 
 class Goal(StrEnum):
-    """What is minimized."""
+    """The number to minimize."""
 
     time = "time"
     cell = "cell"
@@ -164,7 +164,7 @@ def _require_few(searches: Sequence[Search]) -> None:
 
 
 def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
-    """Print the best settings of each search, its preset file, and what to type next."""
+    """Print the best settings of each search, its preset file, and the next command."""
     wide = table_console()
     for each in searches:
         if each.trials:

@@ -103,7 +103,7 @@ def _say(ok: bool, name: str, message: str) -> None:
 
 
 def _message(result: checks.VerificationResult) -> str:
-    """Return an entry's message, with the word for what passed, and what is needed to train the same seeds again."""
+    """Return an entry's message, with the passed check, and the choice that trains the same seeds again."""
     word = f"{result.check}: " if result.ok and result.seeds else ""
     again = "" if result.choice is None else f" [files {result.digest}; choice={result.choice}]"
     return f"{word}{result.message}{again}"
