@@ -735,7 +735,7 @@ class Trainer:
         return actions.reshape(len(stacked), *shape[2:])
 
     def _called(self) -> str:
-        """Name the parts called in an epoch; a generator that a single call moves is blamed on that call, see `Fence`."""
+        """Name the parts called in an epoch; a generator that one call moves is blamed on that call, see `Fence`."""
         entry = self.entry
         return (
             f"algorithm '{entry.algorithm.name}', or what it calls of model '{entry.model.name}' and environment "
