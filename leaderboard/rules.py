@@ -97,7 +97,7 @@ class _Fenced:
     promise:
         Its promise.
     origin:
-        What to call it in messages.
+        Its name in messages.
     """
 
     def __init__(self, rule: SignificanceRule, name: str, promise: str, origin: str) -> None:

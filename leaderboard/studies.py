@@ -1,4 +1,4 @@
-"""Draws the pictures of a study from those of its entries that a results folder holds."""
+"""Draws the pictures of a study from its entries in a results folder."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Report = Callable[[str, int, int], None]
 NOTHING = "nothing is trained yet"
 PLAYED = ("episodes", "deployed")
-"""What pictures show for which trained agents play."""
+"""Data of pictures for which trained agents play."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def read(selection: Selection, members: Sequence[Member]) -> dict[str, EntryResu
 
 
 def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryResults]:
-    """Return the copies of an entry; only those of the same code as the first."""
+    """Return the copies of an entry that have the code of the first copy."""
     stores = [EntryStore.find(folder, entry) for folder in folders]
     found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
     return next(iter(collect.by_code(curves for curves in found if curves is not None)), [])
@@ -200,7 +200,7 @@ def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
     """Count the pairs of entries that rule `times` decides, and all pairs that it tests: both of 20 seeds or more.
 
     Entries are compared within a task, at its shortest horizon; Holm's procedure goes over the task's pairs. Entries
-    of a study with looks are left out: their number of seeds depends on what the seeds showed.
+    of a study with looks are left out: their number of seeds depends on results.
     """
     by_task: dict[str, list[EntryResults]] = {}
     for entry in entries:
@@ -352,9 +352,9 @@ def _episodes(picture: PictureSection, entries: Sequence[EntryResults], report: 
 
 
 def _deployed(picture: PictureSection, entries: Sequence[EntryResults], report: Report | None) -> Figure:
-    """Play the entries' best runs as they were trained, and those with a circuit on the backend at every value.
+    """Play the entries' best runs as trained, and runs with a circuit on the backend at every value.
 
-    What was played on the backend is kept in the entries' folders, and not played again.
+    Episodes on the backend are stored in the entries' folders, and not played again.
     """
     assert picture.evaluation is not None  # `check` saw to it, and to the next
     assert picture.evaluation.deployed is not None

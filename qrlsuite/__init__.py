@@ -1,6 +1,6 @@
 """Honest and fast benchmarks of quantum and classical reinforcement learning.
 
-Importing this package is cheap: torch, PennyLane and Qiskit are imported only by what needs them. Once
+Importing this package is cheap: torch, PennyLane and Qiskit are imported only when they are needed. Once
 this package and Gymnasium are both imported, in either order, `gymnasium.make` knows every environment of the suite
 and its plugins.
 """

@@ -7,7 +7,7 @@
 | `multi-binary` | `MultiBinary(n)` | (L, n) int8, 0 or 1 |
 | `box` | `Box(low, high)` of floats, with finite bounds | (L, *shape), of the box's type and within its bounds |
 
-Whole numbers count from 0, also where the environment's do not. What an algorithm takes stands in its spec
+Whole numbers count from 0, even if the environment's do not. An algorithm's kinds of actions are in its spec
 (`qrlsuite.specs.AlgorithmSpec.actions`).
 """
 
@@ -64,7 +64,7 @@ def from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 
 def check_actions(actions: NDArray[Any], lanes: int, space: spaces.Space[Any] | int) -> None:
-    """Check that actions are those of `lanes` lanes in a space that `from_zero` returned.
+    """Check actions of `lanes` lanes in a space that `from_zero` returned.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def size(space: spaces.Space[Any]) -> int:
 
 
 def choices(space: spaces.Space[Any]) -> list[int]:
-    """Return how many choices each number of an action has; none of a box."""
+    """Return the number of choices for each number of an action; empty for a box."""
     if isinstance(space, spaces.Discrete):
         return [int(space.n)]
     if isinstance(space, spaces.MultiDiscrete):
@@ -132,8 +132,8 @@ def choices(space: spaces.Space[Any]) -> list[int]:
 def information_of_choices(logits: NDArray[np.float64], sizes: Sequence[int]) -> NDArray[np.float64]:
     """Return the Fisher information of independent softmaxes by their logits.
 
-    Of one softmax with probabilities p it is diag(p) - p p^T: the mean, over choices as they are drawn, of the outer
-    product of the gradient of log p.
+    For one softmax with probabilities p it is diag(p) - p p^T: the mean, over drawn choices, of the outer product of
+    the gradient of log p.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def information_of_choices(logits: NDArray[np.float64], sizes: Sequence[int]) ->
 
 
 def from_units(units: NDArray[np.floating[Any]], space: spaces.Box) -> NDArray[Any]:
-    """Map numbers in -1 .. 1 linearly to a box; what lies beyond is clipped, and NaN becomes the middle.
+    """Map numbers in -1 .. 1 linearly to a box; numbers beyond are clipped, and NaN becomes the middle.
 
     A seed that diverged thus goes on acting, and the seeds that are trained with it do, too.
 

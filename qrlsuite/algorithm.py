@@ -1,4 +1,4 @@
-"""What the core expects of a learning algorithm: one class, one file.
+"""The contract of a learning algorithm: one class, one file.
 
 An algorithm trains S agents at once. Every tensor it keeps has the seed axis S first, so that a checkpointed
 group of seeds can be split and merged by slicing.
@@ -30,16 +30,16 @@ class BuildModel(Protocol):
         outputs:
             Numbers that a network returns.
         inputs:
-            Numbers that it is given; None: those of an observation. Where it is given more, as the critic of a
-            continuous action, the observation comes first.
+            Number of its inputs; None: the size of an observation. If it gets more, such as the critic of a continuous
+            action, the observation comes first.
         role:
-            What it is for, `"actor"` or `"critic"`: passed on to a model that asks.
+            Purpose of the network, `"actor"` or `"critic"`: passed on to a model that asks for it.
         """
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What an algorithm keeps in memory, at least; returned by the function `memory` of an `AlgorithmSpec`.
+    """The least memory of an algorithm; returned by the function `memory` of an `AlgorithmSpec`.
 
     Attributes
     ----------
@@ -68,9 +68,9 @@ class Algorithm(Protocol):
     `qrlsuite.seeding.Streams`. Randomness is drawn per seed, from streams that carry the epoch as index where
     a whole epoch's numbers are drawn at once.
 
-    Observations are to be stored as they come and given to the networks as they are: where a task normalizes by
-    running statistics, the populations of `build_model` standardize what they are given, by statistics that stand
-    still during an epoch (`qrlsuite.training.standardization`).
+    Store observations and give them to the networks unchanged: if a task normalizes by running statistics, the
+    populations of `build_model` standardize their inputs, by statistics that stand still during an epoch
+    (`qrlsuite.training.standardization`).
     """
 
     def start(self) -> None:
@@ -79,8 +79,8 @@ class Algorithm(Protocol):
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,).
 
-        An algorithm that learns from data of its own, and steps nothing, has an attribute `offline` that is true.
-        Boards count its epochs in interactions like those of others.
+        An algorithm that learns from data of its own, and steps nothing, has a true attribute `offline`. Boards count
+        its epochs in interactions like the epochs of others.
         """
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -90,9 +90,9 @@ class Algorithm(Protocol):
         training goes on as if no action had been drawn.
 
         It may be `act(observations, begins, infos)` instead: `begins` (S, B) says where an episode begins with the
-        observation, and `infos` has what the lanes said of it, `action_mask` (S, B, choices) among it. What it
-        remembers of an episode is a state of its own, forgotten where one begins: apart from that of training, which
-        is in `state_dict`, and neither is in `policy_state`.
+        observation, and `infos` are the lanes' infos on it, such as `action_mask` (S, B, choices). Its memory of an
+        episode is a state of its own, forgotten where an episode begins. The memory of training is a separate state,
+        in `state_dict`; neither is in `policy_state`.
 
         An algorithm whose network makes a policy may have a method `information(outputs)`: for what the first network
         that it built returned, (S, B, outputs) float64, the Fisher information (S, B, outputs, outputs) of the actions'
@@ -106,7 +106,7 @@ class Algorithm(Protocol):
         """Restore `state_dict`, also onto a group cut from or merged of others at the same epoch."""
 
     def policy_state(self) -> dict[str, Tensor]:
-        """Return the parameters that `act` uses, seed-first: what is published as the trained agents.
+        """Return the parameters that `act` uses, seed-first; they are published as the trained agents.
 
         The tensors themselves, not copies: `qrlsuite evaluate` loads trained parameters into them.
         """

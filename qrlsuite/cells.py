@@ -1,7 +1,7 @@
 """Makes a module of a function or class that was written in a notebook's cell or a script, as workers can import it.
 
-The module holds the source of what is registered, and of all that it names: imports, constants, functions and classes
-from the cells that were run before. What was assigned in the same cell is taken with its assignment.
+The module holds the source of the registered things and of all names that they use: imports, constants, functions and
+classes from earlier cells. A name assigned in the same cell is taken with its assignment.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def module_of(things: list[Any], name: str) -> str:
     Parameters
     ----------
     name:
-        Of what is registered, for messages.
+        Name of the registered thing, for messages.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class _Gathered:
         return "\n".join([*first, *([imports] if imports else []), "\n\n".join(self._pieces)])
 
     def define(self, thing: Any) -> None:
-        """Add a function or class of `__main__` with what it names."""
+        """Add a function or class of `__main__` with the names that it uses."""
         if thing.__name__ in self._known:
             return
         self._known.add(thing.__name__)

@@ -45,7 +45,7 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     running_statistics: bool = False
     """True: agents standardize this environment's observations, see `qrlsuite.training.standardization`."""
     unflattened_space: gymnasium.Space[Any] | None = None
-    """What observations were before lanes flattened them, an image or a Dict; None: `single_observation_space`."""
+    """The space of observations before lanes flattened them, an image or a Dict; None: `single_observation_space`."""
 
     def seed_lanes(self, streams: Sequence[np.random.Generator]) -> None:
         """Replace the random streams; their number divides `num_envs`. Takes effect at the next reset."""
@@ -69,7 +69,7 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
         raise NotImplementedError
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         raise NotImplementedError
 
 
@@ -111,7 +111,7 @@ def endings(
     observations:
         (num_envs, ...), before any reset.
     final:
-        What is known of an episode at its end, (num_envs,) by name, such as `score`.
+        Facts on an episode at its end, (num_envs,) by name, such as `score`.
     """
     ended = done.reshape(-1, *[1] * (observations.ndim - 1))
     known = {name: np.where(done, values, 0.0) for name, values in final.items()}
@@ -126,9 +126,9 @@ def endings(
 class EpisodeLanes(LaneEnv):
     """Lanes of episodes of at most `options.steps` steps, with same-step autoreset; a base for environments.
 
-    A subclass makes its arrays in `_arrays`, lane first, and says how episodes begin (`_draw`, `_begin`), what an
-    action does (`_act`), what is seen (`_seen`) and what an ended episode is worth (`_scores`). A lane whose episode
-    ended stays as it is until it is reset.
+    A subclass makes its arrays in `_arrays`, lane first, and defines the begin of episodes (`_draw`, `_begin`), the
+    effect of an action (`_act`), observations (`_seen`) and the score of an ended episode (`_scores`). A lane whose
+    episode ended does not change until it is reset.
     """
 
     name: ClassVar[str]
@@ -156,11 +156,11 @@ class EpisodeLanes(LaneEnv):
         raise NotImplementedError
 
     def _draw(self, stream: np.random.Generator, count: int) -> Any:
-        """Draw what `count` episodes begin with: an array with that first axis."""
+        """Draw the begin of `count` episodes: an array with that first axis."""
         raise NotImplementedError
 
     def _begin(self, lanes: NDArray[np.intp], drawn: Any) -> None:
-        """Put `lanes` at the beginning of episodes with what was drawn for them."""
+        """Put `lanes` at the beginning of episodes, with their draws."""
         raise NotImplementedError
 
     def _act(
@@ -170,7 +170,7 @@ class EpisodeLanes(LaneEnv):
         raise NotImplementedError
 
     def _seen(self) -> NDArray[np.float32]:
-        """Return what every lane sees, a new array."""
+        """Return every lane's observation, a new array."""
         raise NotImplementedError
 
     def _scores(self) -> NDArray[np.float64]:
@@ -178,7 +178,7 @@ class EpisodeLanes(LaneEnv):
         raise NotImplementedError
 
     def _metrics(self) -> dict[str, NDArray[np.float64]]:
-        """Return what else is measured at an episode's end, (L,) by name."""
+        """Return further metrics at an episode's end, (L,) by name."""
         return {}
 
     def _possible(self, state: Mapping[str, NDArray[Any]]) -> bool:
@@ -347,7 +347,7 @@ class OneLane(gymnasium.Env[Any, Any]):
 
 
 def arrived(observations: NDArray[Any], infos: Mapping[str, Any]) -> NDArray[Any]:
-    """Return where each lane's step arrived, before any reset, of what `LaneEnv.step` returned; (num_envs, ...)."""
+    """Return each lane's observation after a step, before any reset, from `LaneEnv.step`'s results; (num_envs, ...)."""
     if "final_obs" not in infos:
         return observations
     ended = np.asarray(infos["_final_obs"], dtype=np.bool_)

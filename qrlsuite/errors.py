@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 
 
 class QrlSuiteError(Exception):
-    """Invalid input; the message says what is wrong, where, and what to type instead."""
+    """Invalid input; the message names the fault, its place, and a valid input."""
 
 
 class UnknownNameError(QrlSuiteError):
@@ -49,12 +49,12 @@ def listed(names: Sequence[str], most: int = 20) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return `"; did you mean 'x'?"` for the closest known name, the first of several, else the list of what there is.
+    """Return `"; did you mean 'x'?"` for the closest known name, the first of several, else the list of known names.
 
     Parameters
     ----------
     name:
-        What was typed.
+        The typed name.
     known:
         Every name that would have been accepted.
     """

@@ -16,7 +16,7 @@ Model = TypeVar("Model", bound=pydantic.BaseModel)
 
 
 def load(path: Path, model: type[Model], what: str) -> Model:
-    """Read and validate a file; `what` it is, for messages: `preset file`."""
+    """Read and validate a file; `what` names its kind in messages: `preset file`."""
     return validate(parse(read(path, what), f"{what} {path}"), model, f"{what} {path}")
 
 
@@ -75,7 +75,7 @@ def _copied(value: Any) -> Any:
 
 
 def validation_lines(error: pydantic.ValidationError) -> list[str]:
-    """Turn a pydantic error into lines `path = value: what is wrong`."""
+    """Turn a pydantic error into lines `path = value: problem`."""
     lines = []
     for item in error.errors(include_url=False):
         path = ".".join(str(part) for part in item["loc"])
@@ -92,7 +92,7 @@ def problems(error: pydantic.ValidationError, model: type[pydantic.BaseModel]) -
     Parameters
     ----------
     model:
-        What the file was validated as.
+        The model that validated the file.
     """
     lines = []
     for item, line in zip(error.errors(include_url=False), validation_lines(error)):

@@ -51,7 +51,7 @@ class GymLanes(LaneEnv):
     Parameters
     ----------
     env_id:
-        What `gymnasium.make` takes, `"module:Name-v0"` included.
+        An id for `gymnasium.make`, `"module:Name-v0"` included.
     num_envs:
         Number of lanes L, at least 1.
     arguments:
@@ -325,7 +325,7 @@ class GymLanes(LaneEnv):
 
 
 def _places(env_id: str, observe: Sequence[int], flat: spaces.Box) -> NDArray[np.int64]:
-    """Return the places of an observation's values that are shown.
+    """Return the places of the shown values of an observation.
 
     Raises
     ------
@@ -352,7 +352,7 @@ def _no_actions(space: spaces.Space[Any], lanes: int, capacity: int) -> NDArray[
 
 
 def specification(env_id: str) -> gymnasium.envs.registration.EnvSpec:
-    """Return what Gymnasium knows of an id; for `"module:Name-v0"` the module is imported first.
+    """Return Gymnasium's spec of an id; for `"module:Name-v0"` the module is imported first.
 
     Raises
     ------
@@ -453,8 +453,8 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     Parameters
     ----------
     name:
-        Of the registered environment that has the id, where the task is to have that with all its options and be named
-        after it; its own time limit stands then.
+        Name of a registered environment with that id, if the task is to use it with all its options and be named after
+        it; its own time limit then holds.
 
     Raises
     ------
@@ -524,7 +524,7 @@ def _algorithm(kind: str) -> str:
 def random_returns(env_id: str, limit: int | None) -> tuple[float, float]:
     """Return the lowest and the highest return of 10 episodes of random actions, always the same ones.
 
-    Minus infinity where an episode does not end within 1000 steps or fails: nothing is known then.
+    Minus infinity if an episode fails or does not end within 1000 steps.
     """
     lanes = 10
     envs = GymLanes(env_id, lanes, {} if limit is None else {"max_episode_steps": limit})

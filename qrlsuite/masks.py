@@ -1,4 +1,4 @@
-"""Masks: what can be chosen next, where an environment says it (`infos["action_mask"]`, see `qrlsuite.environment`).
+"""Masks of allowed actions, if an environment has them (`infos["action_mask"]`, see `qrlsuite.environment`).
 
 An algorithm keeps the mask of an observation behind it, in one tensor (S, B, obs + choices): so it is stored, drawn
 from a buffer and saved with the observation. Without masks there is nothing behind, and nothing is computed.
@@ -20,16 +20,16 @@ FORBIDDEN = -1e30
 """The output of a choice that is forbidden: below any other, and yet no infinity, whose products are NaN."""
 
 NOTHING: Mapping[str, Any] = {}
-"""What lanes say that say nothing."""
+"""Infos of lanes without masks."""
 
 
 def behind(observations: Tensor, infos: Mapping[str, Any], arrived: bool = False) -> Tensor:
-    """Return observations (S, B, obs) with what can be chosen behind them (S, B, obs + choices), if lanes say it.
+    """Return observations (S, B, obs) with the lanes' masks behind them (S, B, obs + choices), if there are masks.
 
     Parameters
     ----------
     infos:
-        What the lanes said of the observations, lane by lane or by seed.
+        The lanes' infos on the observations, lane by lane or by seed.
     arrived:
         Whether the observations are where steps arrived, before any reset (`qrlsuite.environment.arrived`).
     """
@@ -44,14 +44,14 @@ def behind(observations: Tensor, infos: Mapping[str, Any], arrived: bool = False
 
 
 def observed(seen: Tensor, inputs: int) -> Tensor:
-    """Return the observations (S, B, inputs) of what `behind` returned."""
+    """Return the observations (S, B, inputs) in a result of `behind`."""
     return seen if seen.shape[-1] == inputs else seen[..., :inputs].contiguous()
 
 
 def masked(outputs: Tensor, seen: Tensor, inputs: int) -> Tensor:
-    """Return outputs (S, B, choices) in which those are least that are forbidden by `seen`, of which `inputs` are seen.
+    """Return outputs (S, B, choices) whose forbidden choices are least; `seen` has the mask behind `inputs` values.
 
-    The argmax is none of them, with noise neither, and a softmax gives them 0.
+    The argmax never is a forbidden choice, not even with noise, and a softmax gives them 0.
     """
     if seen.shape[-1] == inputs:
         return outputs
@@ -59,7 +59,7 @@ def masked(outputs: Tensor, seen: Tensor, inputs: int) -> Tensor:
 
 
 def best(population: nn.Module, seen: Tensor, inputs: int) -> Tensor:
-    """Return which output is the largest (S, B) of those that `seen` does not forbid, the first of equal ones."""
+    """Return the index of the largest output (S, B) that `seen` allows, the first of equal ones."""
     if seen.shape[-1] == inputs:
         return populations.best(population, seen)
     with torch.no_grad():
@@ -69,7 +69,7 @@ def best(population: nn.Module, seen: Tensor, inputs: int) -> Tensor:
 def drawn(
     actions: Tensor, seen: Tensor, inputs: int, streams: Sequence[Streams], epoch: int, step: int
 ) -> Tensor:
-    """Return uniform actions (S, B) as they are, or where some are forbidden, uniform ones among the others."""
+    """Return uniform actions (S, B) unchanged, or uniform ones among the allowed actions if some are forbidden."""
     if seen.shape[-1] == inputs:
         return actions
     free = seen[..., inputs:] > 0

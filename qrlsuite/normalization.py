@@ -1,7 +1,7 @@
 """Normalization of observations; the choice is an option of the environment.
 
-Three are fixed before training, and the environment applies them. Running statistics are gathered while a seed trains,
-and training and validation need the same: they belong to the agent, which applies them itself
+Three kinds are fixed before training, and the environment applies them. Running statistics are gathered while a seed
+trains, and training and validation need equal ones: they belong to the agent, which applies them itself
 (`qrlsuite.training.standardization`), and its environment only asks for them.
 """
 
@@ -28,11 +28,11 @@ KIND = (
 class Normalization:
     """Maps observations (..., n) float32 to observations (..., n) float32, each value by itself.
 
-    - `none` returns them as they are.
+    - `none` does not change them.
     - `bounds` maps [low, high] linearly to [-1, 1]. Values outside are not clipped: nothing is lost.
     - `arctan` bounds values that have no bounds to (-pi/2, pi/2), angles a circuit can take (Skolik, Jerbi &
       Dunjko 2022, "Quantum agents in the Gym", section 3.2, for CartPole's velocities).
-    - `running` returns them as they are, too: the agent standardizes them, see `qrlsuite.training.standardization`.
+    - `running` does not change them, either: the agent standardizes them, see `qrlsuite.training.standardization`.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class Normalization:
     space:
         The observations' box, of shape (n,).
     low, high:
-        For `bounds`: the n values that become -1 and 1; absent ones are the box's own.
+        For `bounds`: the n values that become -1 and 1; by default the box's own.
     what:
-        Whose option it is, for messages.
+        Owner of the option, for messages.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The notation of an entry, `[ALGORITHM] MODEL NAME=VALUE ... [preset=FILE]`: what boards print and commands read.
+"""The notation of an entry, `[ALGORITHM] MODEL NAME=VALUE ... [preset=FILE]`, printed by boards and read by commands.
 
 Whatever else has a name and options is written in the same way: an engine (`slurm partition=gpu`), a circuit backend
 (`qiskit shots=1000`), a sampler (`random trials=50`).
@@ -28,7 +28,7 @@ _CLOSING = {"[": "]", "{": "}"}
 
 @dataclass(frozen=True)
 class Written:
-    """An entry as it is written; `qrlsuite.experiment.entry.resolve` makes one of it.
+    """An entry in its written form; `qrlsuite.experiment.entry.resolve` makes an entry of it.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Written:
     def given(
         self, algorithm: str | None = None, settings: tuple[Setting, ...] = (), preset: str | None = None
     ) -> Written:
-        """Return it with what was given beside the text: further settings, and what the text leaves open."""
+        """Return it with further settings, and with an algorithm and a preset if the text lacks them."""
         for name, written, other in (
             ("algorithm", self.algorithm, algorithm),
             (PRESET, self.preset, preset),
@@ -94,7 +94,7 @@ def parse_named(text: str, prefix: str = "") -> tuple[str, dict[str, Any]]:
     Parameters
     ----------
     prefix:
-        What stands before it where it was written, for messages.
+        Text before it in the user's words, for messages.
     """
     names, settings = _parse(text, f"{prefix}'{text}': ")
     if len(names) != 1 or any(setting.side for setting in settings):

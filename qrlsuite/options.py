@@ -1,6 +1,6 @@
 """Options of models, algorithms and environments: pydantic dataclasses, set by defaults, presets and `--set`.
 
-Every error says where the value came from, what is wrong with it, and what to type instead.
+Every error names the value's source, its fault, and a valid value.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ class Since:
 
         momentum: Annotated[float, Field(ge=0, description="..."), Since("0.2.0")] = 0.0
 
-    The default does what was done before there was the option, and never changes: while the option has it, the option
-    is left out of the entry's identity, hash and label (an environment's, out of the task's hash), so that earlier
+    The default does the same as before the option existed, and never changes: an option at its default is left out of
+    the entry's identity, hash and label (an environment's option, out of the task's hash), so that earlier
     results keep their names and random streams, and are resumed.
 
     Attributes
     ----------
     version:
-        Of the package that the options class belongs to.
+        Version of the package that has the options class.
     """
 
     version: str
@@ -145,7 +145,7 @@ def _values(schema: Mapping[str, Any]) -> str:
 
 
 def _typed(value: Any) -> str:
-    """Write a value as it is typed after `--set NAME=`."""
+    """Write a value in the form that `--set NAME=` reads."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -159,7 +159,7 @@ def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
     values:
         Given values by name; absent ones take their defaults.
     where:
-        What the values belong to, for messages: `"model 'mlp'"`.
+        Owner of the values, for messages: `"model 'mlp'"`.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def plain(options: Any) -> Values:
 
 
 def identity(options: Any) -> Values:
-    """Return what an entry's hash covers: `plain` without the options marked `Since` that have their default."""
+    """Return the content of an entry's hash: `plain` without the options marked `Since` that have their default."""
     result: Values = _without_later(options, plain(options))
     return result
 
@@ -266,7 +266,7 @@ def per_agent(cls: type[Any]) -> set[str]:
 
 
 def _pydantic_fields(cls: type[Any]) -> Mapping[str, pydantic.fields.FieldInfo]:
-    """Return what pydantic knows of every option, of a plain dataclass too."""
+    """Return pydantic's field of every option, for a plain dataclass too."""
     if is_dataclass(cls) and not hasattr(cls, "__pydantic_fields__"):
         cls = pydantic.dataclasses.dataclass(cls, frozen=vars(cls)["__dataclass_params__"].frozen)
     return getattr(cls, "model_fields", None) or getattr(cls, "__pydantic_fields__", {})
@@ -294,14 +294,14 @@ class Setting:
 
     @property
     def written(self) -> str:
-        """The name with what stands before it: `--set model.width`."""
+        """The name with its prefix: `--set model.width`."""
         return f"{self.prefix}{self.full_name}"
 
 
 def parse_setting(word: str, prefix: str = "--set ") -> Setting:
     """Parse `[environment.|model.|ansatz.|algorithm.]name=value`; the value is read as TOML, else as text.
 
-    `prefix` is what stands before it where it was written, for messages.
+    `prefix` is the text before it in the user's words, for messages.
     """
     key, equals, text = word.partition("=")
     if not equals or not key.strip():

@@ -1,7 +1,7 @@
 """Plugins by path: a Python file or a package's folder that is used as it lies there, without being installed.
 
-What a file or folder holds is read once, when it is loaded: that is what runs, what an entry's code identity covers,
-and what is copied into the entry's folder, whatever becomes of the file meanwhile. Its top-level module is imported
+The content of a file or folder is read once, when it is loaded. This content runs, is covered by an entry's code
+identity, and is copied into the entry's folder, even if the file changes meanwhile. Its top-level module is imported
 under its own name. In the registry the name of the file or folder stands where an installed plugin has the name of its
 distribution.
 
@@ -38,12 +38,12 @@ from qrlsuite.registry import Plugin, Registered, Registry
 MOST_BYTES, MOST_FILES = 16 << 20, 500
 """What a plugin may hold at most."""
 _MOST_WORDS = 300
-"""Characters of an error's message that are shown."""
+"""Shown characters of an error's message."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What a plugin's file or folder holds, as it was read.
+    """The content of a plugin's file or folder when it was read.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Source:
 
     @classmethod
     def unpacked(cls, packed: Any, folder: Path) -> Source:
-        """Return what `packed` returned, as a plugin in a folder of its own below another one; writes nothing.
+        """Return a result of `packed` as a plugin in its own folder below another folder; writes nothing.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class Source:
 
 @dataclass
 class Loaded:
-    """A loaded plugin and what it registered.
+    """A loaded plugin and its registered things.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class Loaded:
 
     @property
     def sentence(self) -> str:
-        """What it registers, in a line: `ring.py: ansatz ring`."""
+        """Its registered things, in a line: `ring.py: ansatz ring`."""
         things = [f"{each.spec.kind.replace('_', ' ')} {each.spec.name}" for each in self.registered]
         return f"{self.source.name}: {listed(things) or 'commands alone'}"
 
@@ -139,7 +139,7 @@ class _Own:
     Attributes
     ----------
     handed:
-        What `register` was given while a plugin is imported, with file and line; None while none is.
+        Arguments of `register` while a plugin is imported, with file and line; None at other times.
     """
 
     loaded: dict[str, Loaded] = field(default_factory=dict)
@@ -213,7 +213,7 @@ def _no_plugin(shown: str, place: Path) -> str:
 
 
 def _package(shown: str, place: Path) -> Path:
-    """Return the folder of the package: the one that is given, or the only one in `src` of a project's folder."""
+    """Return the folder of the package: the given folder, or the only package in `src` of a project's folder."""
     if (place / "__init__.py").is_file():
         return place
     inner = sorted(path.parent for path in place.glob("src/*/__init__.py"))
@@ -225,7 +225,7 @@ def _package(shown: str, place: Path) -> Path:
 
 
 def _package_of(folder: Path | None, path: str) -> str:
-    """Return the name of the package that a project's folder has; that of the path where it is none."""
+    """Return the name of the package in a project's folder; the path's name if it is no project."""
     place = (folder or Path()) / path
     try:
         return _package(path, place).name if place.is_dir() else place.name
@@ -264,7 +264,7 @@ def _bytes(shown: str, path: Path) -> bytes:
 
 
 def load(path: str | os.PathLike[str]) -> Loaded:
-    """Import a plugin's file or folder, and register what is in it; the same content again does nothing.
+    """Import a plugin's file or folder, and register its things; loading equal content again does nothing.
 
     A plugin of the same path whose content has changed takes the place of the earlier one.
 
@@ -283,7 +283,7 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
     Parameters
     ----------
     folder:
-        Of the file: what the paths are relative to.
+        Folder of the file: the paths are relative to it.
     source:
         The file, for messages.
 
@@ -308,15 +308,15 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
 
 
 def load_source(source: Source, cell: bool = False, things: Sequence[tuple[Any, str]] = ()) -> Loaded:
-    """Do what `load` does with what was read before.
+    """Like `load`, with content that was read before.
 
     Parameters
     ----------
     cell:
         See `Loaded`.
     things:
-        What to register, each with file and line of who asked for it: specs, or names in the module. Without any, what
-        the module itself registers.
+        Things to register, each with the caller's file and line: specs, or names in the module. If empty, the module
+        registers them itself.
     """
     own, known = _own(), registry.load()
     before = next((each for each in own.loaded.values() if each.source.module == source.module), None)
@@ -425,7 +425,7 @@ def _require_unique(known: Registry, new: Sequence[Registered[Any]]) -> None:
 
 
 def _require_free(source: Source) -> None:
-    """Refuse a plugin whose module's name is that of another module."""
+    """Refuse a plugin whose module has the name of another module."""
     name = source.module
     if source.name in {each.distribution for each in registry.load().plugins}:
         raise PluginError(f"{source.path}: there is an installed plugin {source.name}: rename this one")
@@ -481,7 +481,7 @@ def failure(error: BaseException) -> str:
 
 
 def place(error: BaseException) -> str:
-    """Return the line of a plugin's code in which an error arose, or which called what raised it; `""` for none."""
+    """Return the innermost line of a plugin's code in an error's traceback; `""` without one."""
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         if where := _line(frame.f_code.co_filename, frame.f_globals.get("__name__"), line):
             return where
@@ -512,7 +512,7 @@ def _line(file: str, module: Any, line: int) -> str:
 
 
 def placed(error: OptionError) -> OptionError:
-    """Return an error of the suite with the line of a plugin's code that caused it; a plugin's own stays as it is."""
+    """Return an error of the suite with the line of a plugin's code that caused it; a plugin's own is unchanged."""
     *_, (last, _) = traceback.walk_tb(error.__traceback__)
     where = place(error)
     if not where or where in str(error) or not str(last.f_globals.get("__name__")).startswith("qrlsuite."):
@@ -527,7 +527,7 @@ def blamed() -> Iterator[None]:
     Raises
     ------
     PluginError
-        With the line, and what to do.
+        With the line, and the remedy.
     """
     try:
         yield
@@ -637,14 +637,14 @@ class _Finder(importlib.abc.MetaPathFinder):
 
 
 class _Loader(SourceFileLoader):
-    """Imports what was read; leaves no compiled files."""
+    """Imports the content that was read; leaves no compiled files."""
 
     def __init__(self, name: str, path: str, source: Source) -> None:
         super().__init__(name, path)
         self._files = {source.place(file): content for file, content in source.files.items()}
 
     def get_data(self, path: str) -> bytes:
-        """Return a file's content as it was read."""
+        """Return a file's content when the plugin was read."""
         known = self._files.get(os.fspath(path))
         return super().get_data(path) if known is None else known
 
@@ -654,7 +654,7 @@ class _Loader(SourceFileLoader):
 
 
 def write(source: Source, folder: Path) -> Path:
-    """Write what was read into a folder; returns the path of the plugin there."""
+    """Write a plugin's content into a folder; return the path of the plugin there."""
     for name, content in source.files.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)

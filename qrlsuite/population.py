@@ -134,7 +134,7 @@ def sweep(population: nn.Module, parameters: Sequence[Tensor], activation: str) 
 
 
 def _sweep_of(population: nn.Module) -> Sweep | None:
-    """Return the sweep of a population that does nothing else to what it is given."""
+    """Return the sweep of a population that does nothing else to its inputs."""
     if population._forward_hooks or population._forward_pre_hooks:
         return None
     found: Callable[[], Sweep | None] | None = getattr(population, "sweep", None)
@@ -167,14 +167,14 @@ def _chosen(values: Tensor, chosen: Tensor) -> Tensor:
 def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor) -> Tensor:
     """Set the gradients of a mean squared error, summed over the agents, in a population's parameters.
 
-    Of a population that is one compiled sweep, autograd is left out; the bits are the same.
+    A population of one compiled sweep does without autograd; the bits are equal.
 
     Parameters
     ----------
     x:
         (S, B, in).
     chosen:
-        Of each sample, the output that should be its aim (S, B).
+        The output of each sample that should equal its aim (S, B).
     aims:
         (S, B).
 
@@ -209,7 +209,7 @@ def remembers(module: nn.Module) -> int:
 
     A module that remembers has an attribute `remembers`, a whole number M. `forward(x, state)` then returns outputs
     (B, out) and the next state (B, M) for x (B, in) and the state so far (B, M), which is 0 where an episode begins.
-    `forward(x)` returns the outputs alone, those of an episode's first step.
+    `forward(x)` returns the outputs of an episode's first step alone.
     """
     return int(getattr(module, "remembers", 0))
 
@@ -241,14 +241,14 @@ def unroll(population: nn.Module, seen: Tensor, begins: Tensor, state: Tensor) -
     seen:
         Observations (S, B, K, in).
     begins:
-        1 where an episode begins, so that what is remembered is forgotten, else 0 (S, B, K).
+        1 where an episode begins, which clears the memory, else 0 (S, B, K).
     state:
-        What is remembered before (S, B, M).
+        The memory before (S, B, M).
 
     Returns
     -------
     tuple
-        Outputs (S, B, K, out), and what is remembered after every step (S, B, K, M).
+        Outputs (S, B, K, out), and the memory after every step (S, B, K, M).
     """
     outputs, states = [], []
     for k in range(seen.shape[2]):
@@ -267,7 +267,7 @@ def learning_rates(module: nn.Module) -> dict[str, float]:
     Raises
     ------
     ValueError
-        If a name is none of its parameters, or a factor is not above 0.
+        If a name is no parameter's, or a factor is not above 0.
     """
     declared: Callable[[], Mapping[str, float]] | None = getattr(module, "learning_rates", None)
     factors = {} if declared is None else {name: float(factor) for name, factor in declared().items()}
@@ -290,7 +290,7 @@ def count_parameters(module: nn.Module) -> tuple[int, int]:
 
 
 def count_fixed(module: nn.Module) -> int:
-    """Return the number of scalars of one agent's module that stay as they were drawn."""
+    """Return the number of scalars of one agent's module that stay as drawn."""
     return sum(p.numel() for p in module.parameters() if not p.requires_grad)
 
 
@@ -408,7 +408,7 @@ _NOT_VMAPPABLE = re.compile(
     r"vmap|functorch|batching rule|data pointer of Tensor|broadcast shape|Could not run 'aten::",
     re.IGNORECASE,
 )
-"""What torch 2.4 to 2.13 say where one agent's module can be run and a stack of them cannot."""
+"""Messages of torch 2.4 to 2.13 if one agent's module can be run and a stack of modules cannot."""
 
 
 def _exact(module: nn.Module) -> nn.Module:
@@ -541,7 +541,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, active: Tensor | None = None) -> None:
-        """Move every agent, or those where `active` (S,) bool is true, along its gradient."""
+        """Move every agent, or only the ones with a true `active` (S,), along its gradient."""
         self.steps += 1 if active is None else active.to(torch.int64)
         if self._compiled and self._move(active):
             return
@@ -650,7 +650,7 @@ class Adam:
         return state
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.steps.copy_(state["steps"])
         for name in self.mean:
             self.mean[name].copy_(state[f"mean.{name}"])
@@ -659,12 +659,12 @@ class Adam:
 
 @functools.lru_cache(4)
 def _corrections(beta1: float, beta2: float, count: int) -> tuple[float, float]:
-    """Return by what Adam's moments are multiplied after some steps, as they begin at 0: the first, and the root."""
+    """Return the bias corrections of Adam's moments after some steps: of the first, and of the root of the second."""
     return 1.0 / (1.0 - beta1**count), 1.0 / math.sqrt(1.0 - beta2**count)
 
 
 def gradients(loss: Tensor, population: nn.Module) -> None:
-    """Set the gradients of a loss in a population's trainable parameters, and leave those of others that it uses."""
+    """Set the gradients of a loss in a population's trainable parameters, and in no other parameters."""
     parameters = [p for p in population.parameters() if p.requires_grad]
     for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters, allow_unused=True)):
         parameter.grad = gradient
@@ -672,7 +672,7 @@ def gradients(loss: Tensor, population: nn.Module) -> None:
 
 @torch.no_grad()
 def follow(target: nn.Module, population: nn.Module, tau: float) -> None:
-    """Move a target network's parameters by `tau` of the way to those of the network that it is a copy of."""
+    """Move a target network's parameters by `tau` of the way to the parameters of the network that it copies."""
     for slow, parameter in zip(target.parameters(), population.parameters()):
         slow.lerp_(parameter, tau)
 

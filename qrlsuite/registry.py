@@ -1,11 +1,11 @@
-"""Finds plugins, and looks up what they register.
+"""Finds plugins, and looks up their registered things.
 
 `load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that does not
 fit this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is
 reported by the name of its distribution and skipped as a whole; everything else works. A name registered twice is
 an error that names both places when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the
 first of these problems ends the command. `QRLSUITE_LOAD_PLUGINS=acme-qrl,other` loads the plugins of these
-distributions only, and an empty value those of the suite only.
+distributions only, and an empty value the suite's plugins only.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ class Registered(Generic[S_co]):
 
 @dataclass
 class Plugin:
-    """An entry point, and what loading it gave: specs or a problem.
+    """An entry point, and the result of loading it: specs or a problem.
 
     Attributes
     ----------
     name:
         Its name among the distribution's entry points.
     module:
-        What it points at.
+        Its target.
     version:
         The distribution's version; `""` where there is none.
     requires:
@@ -92,14 +92,14 @@ class Registry:
     problems: list[str] = field(default_factory=list)
     strict: bool = False
     own: Any = None
-    """What `qrlsuite.own` keeps of the plugins that were loaded by path."""
+    """Data of `qrlsuite.own` on plugins loaded by path."""
     announce: Callable[[str], None] = lambda line: None
     """Called with a line for the user when a plugin has been loaded by path."""
     on_backends: list[Registered[specs.ModelSpec]] = field(default_factory=list)
     """The models for every circuit backend."""
 
     def of(self, kind: type[S]) -> Mapping[str, Registered[S]]:
-        """Return what is registered of a kind, by name."""
+        """Return the registered things of a kind, by name."""
         return self.entries[kind]
 
     def names(self, kind: type[specs.Spec]) -> list[str]:
@@ -148,7 +148,7 @@ class Registry:
         return self.add(self.collect(plugin, distribution))
 
     def collect(self, plugin: Any, distribution: str) -> list[Registered[Any]]:
-        """Register a plugin object with the manager; returns what its hooks hand over, which is not looked up yet.
+        """Register a plugin object with the manager; return the specs from its hooks, not yet added.
 
         Raises
         ------
@@ -179,7 +179,7 @@ class Registry:
         return handed
 
     def add(self, new: Iterable[Registered[Any]]) -> dict[str, list[str]]:
-        """Add what was registered; returns its names by kind in the plural."""
+        """Add registered things; return their names by kind in the plural."""
         registered: dict[str, list[str]] = {}
         for each in new:
             for one in self._with_models(each):
@@ -392,7 +392,7 @@ def required_versions(distribution: metadata.Distribution | None) -> str:
     Raises
     ------
     PluginError
-        If what it requires cannot be read.
+        If its requirements cannot be read.
     """
     if distribution is None or distribution.name == "qrlsuite":
         return ""
@@ -420,7 +420,7 @@ def check_version(distribution: metadata.Distribution | None, version: str | Non
     Raises
     ------
     PluginError
-        Naming the distribution, what it requires, what there is, and what to type.
+        Names the distribution, the required and the present version, and the command to type.
     """
     needs = required_versions(distribution)
     if not needs or distribution is None:

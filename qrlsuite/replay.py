@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 class Replay:
-    """A ring of rows for each of S seeds, all filled alike: what an off-policy algorithm learns from.
+    """A replay buffer: a ring of rows for each of S seeds, all filled alike.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Replay:
         Parameters
         ----------
         draws:
-            (S, B) float64, uniform in [0, 1): with replacement from what is held.
+            (S, B) float64, uniform in [0, 1): they choose stored rows, with replacement.
         """
         seeds, capacity, numbers = self.rows.shape
         if self.rows.is_cpu:
@@ -77,7 +77,7 @@ class Replay:
         return {name: part.contiguous() for name, part in zip(self.columns, parts)}
 
     def _picked(self, draws: Tensor) -> dict[str, Tensor]:
-        """Return what `batch` does, by one compiled loop."""
+        """Like `batch`, by one compiled loop."""
         from qrlsuite.compiled.networks import pick
 
         seeds, batch = draws.shape
@@ -96,6 +96,6 @@ class Replay:
         return {"rows": self.rows, "stored": torch.full((len(self.rows),), self.stored, dtype=torch.int64)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.rows.copy_(state["rows"])
         self.stored = int(state["stored"][0])

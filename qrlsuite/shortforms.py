@@ -6,9 +6,9 @@
     a gymnasium.Env          __init__(self, ...)                                environment
     an algorithm's class     __init__(self, envs, build_model, streams, device, ...)   algorithm
 
-Every further parameter is an option, with its annotation and its default. In the place of further parameters there may
-be a parameter `options`, annotated with a dataclass, as a package writes it. The name is that of the function or class
-in lower case with hyphens, the summary the first line of its docstring.
+Every further parameter is an option, with its annotation and its default. One parameter `options`, annotated with a
+dataclass, may replace further parameters, as in a package. The name is the function's or class's in lower case with
+hyphens, the summary the first line of its docstring.
 
 A model's class attribute `family = "quantum"` says that it is one; otherwise it is one where its `__init__` or module
 says `qrlsuite.layer`. Episodes of an environment end after 1000 steps.
@@ -35,10 +35,10 @@ EPISODE_STEPS = 1000
 """At which episodes of an environment end."""
 
 _ALGORITHM = ("start", "train_epoch", "act", "state_dict", "load_state_dict", "policy_state")
-"""The methods by which an algorithm is known."""
+"""The methods that identify an algorithm."""
 
 HANDED = ("envs", "build_model", "streams", "device")
-"""What an algorithm's class is built with, beside options."""
+"""Arguments of an algorithm's class, beside options."""
 
 
 ASKED = ("generator", "space", "role")
@@ -105,7 +105,7 @@ def public(module: ModuleType) -> list[Any]:
 def recognized(module: ModuleType) -> list[Any]:
     """Return the functions and classes in a module that are short forms: public ones that are defined there.
 
-    A `torch.nn.Module` whose `__init__` cannot be that of a model is a part of one, and is left out.
+    A `torch.nn.Module` whose `__init__` does not fit a model is a part of a model, and is left out.
     """
     found = [(thing, kind_of(thing)) for thing in public(module)]
     return [
@@ -135,7 +135,7 @@ def line_of(thing: Any) -> int | None:
 
 
 def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
-    """Return the spec of a short form; what its references name is put into the module.
+    """Return the spec of a short form; the targets of its references are put into the module.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
     Raises
     ------
     PluginError
-        If it is no short form, or a parameter cannot be an option; the message says what to write.
+        If it is no short form, or a parameter cannot be an option; the message has the remedy.
     """
     kind = kind_of(thing)
     if kind is None:
@@ -180,7 +180,7 @@ def _title(thing: Any) -> str:
 
 
 class _Holder:
-    """Puts what references name into a module."""
+    """Puts the targets of references into a module."""
 
     def __init__(self, module: ModuleType, name: str) -> None:
         self.module, self.name = module, name
@@ -232,7 +232,7 @@ def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Sp
 
 
 def circuit_parameters(module: Any) -> set[str]:
-    """Return the names of a module's parameters that are those of `qrlsuite.layer`: its `quantum_parameters`."""
+    """Return the names of a module's parameters that belong to `qrlsuite.layer`: its `quantum_parameters`."""
     return {
         f"{place}.{name}" if place else name
         for place, part in module.named_modules()
@@ -294,9 +294,9 @@ def _signature(
     Parameters
     ----------
     first:
-        What is handed over by position; the parameters may have other names.
+        Arguments by position; the parameters may have other names.
     named, optional:
-        What is handed over by name: always, and where there is such a parameter.
+        Arguments by name: always, and if there is such a parameter.
     """
     parameters = [
         each

@@ -48,7 +48,7 @@ def resolve(reference: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """What every registered thing has.
+    """Attributes of every registered thing.
 
     Attributes
     ----------
@@ -83,13 +83,13 @@ class Spec:
 
 @dataclass(frozen=True, slots=True)
 class NumericSpec(Spec):
-    """What a spec has of which an entry's numbers are made.
+    """Attributes of things that make an entry's numbers.
 
     Attributes
     ----------
     numerics:
-        Of the suite's own: raised when its bits change, so that earlier seeds are not continued with it. A plugin's
-        code is compared itself, see `qrlsuite.experiment.identity`.
+        Only for the suite's own things: raised when its bits change, so that earlier seeds are not continued with it. A
+        plugin's code is compared itself, see `qrlsuite.experiment.identity`.
     """
 
     numerics: int = field(default=1, kw_only=True)
@@ -134,10 +134,10 @@ class EnvironmentSpec(NumericSpec):
         observations (num_envs, ...) to actions (num_envs, ...). It may look into `envs`, and so know what no
         agent is shown. Uniformly random actions need no policy.
     pictures:
-        What `qrlsuite plot` can draw of it.
+        Pictures of it for `qrlsuite plot`.
     views:
-        Options that change what agents see, and nothing of what happens or what they earn: a study with looks compares
-        entries of tasks that differ in these alone.
+        Options that change agents' observations alone, neither events nor rewards: a study with looks compares entries
+        of tasks that differ in these options only.
     """
 
     kind, kinds = "environment", "environments"
@@ -173,9 +173,9 @@ class ModelSpec(NumericSpec):
         (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
         `qrlsuite.population.stack`.
     memory:
-        Reference to `memory(options, agents, batch, copies) -> int`: the bytes that a population of `agents` takes at
-        least, with `copies` of all its parameters in memory, while every agent computes `batch` samples. What does not
-        fit is refused before it is trained. None where it is unknown.
+        Reference to `memory(options, agents, batch, copies) -> int`: the least bytes of a population of `agents`, with
+        `copies` of all its parameters in memory, while every agent computes `batch` samples. A group that does not fit
+        is refused before training. None if unknown.
     faster:
         Name of a model that computes the same function much faster; recommended where training takes hours.
     backends:
@@ -224,8 +224,8 @@ class AlgorithmSpec(NumericSpec):
     factory:
         Reference to the class: see `qrlsuite.algorithm.Algorithm`.
     memory:
-        Reference to `memory(options, rounds) -> qrlsuite.algorithm.Memory`: what it keeps in memory at least, where
-        an epoch has `rounds` steps of every environment. None where it is unknown.
+        Reference to `memory(options, rounds) -> qrlsuite.algorithm.Memory`: its least memory if an epoch has `rounds`
+        steps of every environment. None if unknown.
     actions:
         The kinds of actions that it takes: some of `qrlsuite.actions.KINDS`.
     """

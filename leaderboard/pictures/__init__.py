@@ -34,8 +34,8 @@ class Picture:
     module:
         The module with its dataclass of settings and its function `draw`.
     data:
-        What `draw` takes first: entries, episode values by policy, or scores of trained agents on a circuit backend;
-        None where it takes the settings alone.
+        First argument of `draw`: entries, episode values by policy, or scores of trained agents on a circuit backend;
+        None if it takes the settings alone.
     """
 
     summary: str
@@ -81,7 +81,7 @@ def draw(kind: str, entries: Sequence[EntryResults] = (), **settings: Any) -> Fi
     kind:
         A key of `KINDS`.
     entries:
-        What it shows; empty for a picture of nothing.
+        The entries to show; empty for a picture without results.
     settings:
         Its options by name.
     """

@@ -17,7 +17,7 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 
 WIDEST = 12.0
-"""Inches; on a page, what is written in a wider picture could not be read."""
+"""Inches; on a page, the text of a wider picture would be too small."""
 
 
 @dataclass(frozen=True)

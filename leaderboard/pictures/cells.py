@@ -1,4 +1,4 @@
-"""Options shared by pictures of sample complexity: which cells, up to which horizon, with what certainty."""
+"""Options shared by pictures of sample complexity: cells, horizon and certainty."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def choose_grid(
     deltas: Sequence[float] | None,
     thresholds: Sequence[float] | None = None,
 ) -> Grid:
-    """Return the cells that were asked for; where nothing was, those of the task's ranking grid."""
+    """Return the requested cells, by default the cells of the task's ranking grid."""
     ranking = entry.task_file.ranking
     chosen_deltas = deltas if deltas is not None else ranking.deltas
     if epsilons is not None and thresholds is not None:
@@ -104,18 +104,18 @@ def choose_horizon(entries: Sequence[EntryResults], requested: int | None = None
 
 
 def level_name(entry: EntryResults) -> str:
-    """Return what the rows of a grid of an entry's task are called."""
+    """Return the title of the rows of a grid of an entry's task."""
     name = entry.task_file.ranking.level_name
     return "ε" if name == "epsilon" else style.plain(name)
 
 
 def levels(grid: Grid) -> list[str]:
-    """Return the rows of a grid as they are written: epsilons, or thresholds on the return or a metric."""
+    """Return the titles of a grid's rows: epsilons, or thresholds on the return or a metric."""
     return [f"{value:g}" for value in (grid.levels)]
 
 
 def probabilities(grid: Grid) -> list[str]:
-    """Return the columns of a grid as they are written."""
+    """Return the titles of a grid's columns."""
     return [f"{float(value):g}" for value in grid.deltas]
 
 

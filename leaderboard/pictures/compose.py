@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Composed:
-    """A picture, and what it shows.
+    """A picture, and its subject.
 
     Attributes
     ----------
     entries:
         Empty for a picture of no entries.
     tasks:
-        The tasks of the entries, or those whose environment is shown.
+        The tasks of the entries, or the tasks whose environment is shown.
     left_out:
         One line for each entry that was left out and why.
     """
@@ -134,7 +134,7 @@ def describe(kind: str) -> dict[str, Any]:
 
 
 def summaries() -> dict[str, str]:
-    """Return one line for every picture; those of environments say of which."""
+    """Return one line for every picture; pictures of environments name them."""
     lines = {name: picture.summary for name, picture in pictures.KINDS.items()}
     for name, owners in _environment_pictures().items():
         summary = next(iter(owners.values())).summary

@@ -112,7 +112,7 @@ def _tick(value: float, position: object) -> str:
 
 
 def _between_decades(low: float, high: float) -> Callable[[float, object], str]:
-    """Return what labels ticks between powers of ten: all on a short axis, 2 and 5 on a longer one, else none."""
+    """Return a formatter of ticks between powers of ten: all on a short axis, 2 and 5 on a longer one, else none."""
     decades = math.log10(high / low)
     labeled = range(2, 10) if decades < 0.4 else (2, 5) if decades < 1.2 else ()
 

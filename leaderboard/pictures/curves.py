@@ -80,7 +80,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
 
 
 def _policies(axes: Axes, scores: Mapping[str, float]) -> None:
-    """Draw a line at what other policies score, with its name beside the curves."""
+    """Draw a line at the score of each other policy, with its name beside the curves."""
     for score in scores.values():
         axes.axhline(score, color="#808080", linewidth=0.8, linestyle=":", zorder=1)
     low, high = axes.get_ylim()

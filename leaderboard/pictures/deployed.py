@@ -18,7 +18,7 @@ from qrlsuite.training.evaluation import Played
 
 
 class Line(NamedTuple):
-    """An entry's agents as they were trained, and on the backend at each of K values; () without a circuit."""
+    """An entry's agents as trained, and on the backend at each of K values; () without a circuit."""
 
     trained: Played
     deployed: tuple[Played, ...]
@@ -36,7 +36,7 @@ class DeployedOptions:
 def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figure:
     """Draw the mean score of an entry's agents against the values, with what each agent earns as dots.
 
-    Agents that act as they were trained are a horizontal line: dashed for circuits, dotted for networks. On a task
+    Agents that act as trained are a horizontal line: dashed for circuits, dotted for networks. On a task
     without a known maximum the picture shows returns.
 
     Parameters
@@ -44,7 +44,7 @@ def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figur
     lines:
         One or more entries, which played the same episodes.
     values:
-        The K values as they are written.
+        The K values as texts.
     """
     chosen: DeployedOptions = options.build(DeployedOptions, settings, "picture 'deployed'")
     if not any(line.deployed for line in lines):

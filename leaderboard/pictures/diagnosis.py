@@ -118,7 +118,7 @@ def draw_agents(measured: Sequence[Diagnosis], title: str = "") -> Figure:
 
 
 def _positive(values: Any) -> Any:
-    """Return values for an axis of logarithms: what is 0, or rounding, is left out."""
+    """Return values for an axis of logarithms, without values that are 0 or rounding errors."""
     return np.where(values > 1e-12 * np.nanmax(values, initial=0.0), values, np.nan)
 
 

@@ -210,7 +210,7 @@ def _learning(
 
 
 def _line(place: int, name: str) -> Line2D:
-    """Return what the legend shows of the entry, or the set of seeds, at a place."""
+    """Return the legend's line of the entry, or the set of seeds, at a place."""
     look = style.style(place)
     return Line2D([], [], color=look.color, ls=look.line, lw=1.5, label=name)
 

@@ -98,7 +98,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
 
 
 def _cut(entries: Sequence[EntryResults], requested: int | None) -> tuple[list[EntryResults], list[str]]:
-    """Cut the entries of each task to one length; returns them, and what to say of it."""
+    """Cut the entries of each task to one length; return them with notes."""
     shown, notes = list[EntryResults](), list[str]()
     for task in dict.fromkeys(entry.task_hash for entry in entries):
         members = [entry for entry in entries if entry.task_hash == task]
@@ -136,7 +136,7 @@ def _has(value: Any, setting: Setting) -> bool:
 
 
 def _groups(rows: Sequence[Mapping[str, Any]], x: str, y: str, by: Sequence[str]) -> tuple[Groups, str]:
-    """Return the values of y by line and x; and what to say of entries that lack a field or share a point."""
+    """Return the values of y by line and x, and notes on entries that lack a field or share a point."""
     found: dict[tuple[str, ...], dict[Any, list[float]]] = {}
     behind: dict[Any, set[Any]] = {}
     lacking = set()
@@ -231,7 +231,7 @@ def _handle(index: int, names: Sequence[str], values: Sequence[str]) -> Line2D:
 
 
 _SAY_ALL = ("task", "entry", "name", "algorithm", "model")
-"""Fields of which a value alone says what it is."""
+"""Fields whose values need no name beside them."""
 
 
 def _seeds(entries: Sequence[EntryResults]) -> str:

@@ -25,7 +25,7 @@ TICKS = (0.1, 0.2, 0.333, 0.5, 0.667, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 """Ratios of mean times that the axis may name."""
 WIDEST = (TICKS[0], TICKS[-1])
 TUNED = ", tuned"
-"""What the name of an entry has more than that of the same model before tuning."""
+"""End of a tuned entry's name, which the untuned model's name lacks."""
 GRAY = "#8c8c8c"
 LOOKS: dict[Decided | None, tuple[str, str, str]] = {
     Decided.FIRST: ("A needs fewer steps", style.COLORS[0], "o"),
@@ -35,14 +35,14 @@ LOOKS: dict[Decided | None, tuple[str, str, str]] = {
     Decided.NOT_TOLD_APART: ("not told apart", GRAY, "v"),
     None: ("open", GRAY, "x"),
 }
-"""What the legend says, color and marker, by what was decided of a pair."""
+"""Text of the legend, color and marker, by a pair's decision."""
 
 
 def draw(outcome: StudyOutcome) -> Figure:
     """Draw a row for each pair, below the question that it answers.
 
-    The axis is the mean time below threshold of B over that of A, in logarithms: twice as long is as far to the right
-    as half as long is to the left. Lines are repeated confidence intervals. Both are cut at a factor of 10.
+    The axis is B's mean time below threshold over A's, in logarithms: twice as long is as far to the right as half as
+    long is to the left. Lines are repeated confidence intervals. Both are cut at a factor of 10.
     """
     study, decision = outcome.study, outcome.state.decision
     if not any(pair.p for pair in decision.pairs):
@@ -127,8 +127,8 @@ def draw_entries(outcome: StudyOutcome) -> Figure:
 def draw_together(together: StudiesTogether) -> Figure:
     """Draw a row for each task below each pair that all studies compare, and the mean over the tasks.
 
-    The axis is that of `draw`. A task's row has the verdict, interval and seeds of its own study; the mean is that of
-    `StudiesTogether`.
+    The axis is as in `draw`. A task's row has the verdict, interval and seeds of its own study; `StudiesTogether`
+    computes the mean.
     """
     if not together.pairs:
         raise OptionError(f"no pair has a mean over the tasks: {'; '.join(together.left_out)}")
@@ -208,14 +208,14 @@ def _ratios(axes: Axes, ends: Sequence[float], margin: float) -> None:
 
 
 def _legend(axes: Axes, pairs: Sequence[PairDecision]) -> None:
-    """Name what was decided of the pairs."""
+    """Add a legend of the pairs' decisions."""
     for each, (label, color, marker) in LOOKS.items():
         if any(pair.decided is each for pair in pairs):
             axes.plot([], [], marker, color=color, label=label, ls="none")
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Return those of `TICKS` in a range whose labels, from 1 outward, do not touch."""
+    """Return the `TICKS` in a range whose labels, from 1 outward, do not touch."""
     room = 0.09 * math.log(high / low)
     kept = [1.0]
     for tick in sorted(TICKS, key=lambda tick: abs(math.log(tick))):
@@ -256,7 +256,7 @@ def _within(ratio: float) -> float:
 
 
 def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
-    """Draw a pair and return the ends of what was drawn, as ratios."""
+    """Draw a pair and return the ends of its line, as ratios."""
     if not pair.p or math.isnan(pair.difference):
         text = "both mean times are 0" if pair.p else "no look yet"
         axes.annotate(text, (1, height), fontsize=8, va="center")

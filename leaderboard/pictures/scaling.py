@@ -60,7 +60,7 @@ class _Line:
 
 @plain_dataclass(frozen=True)
 class _Panel:
-    """What is varied, and the lines."""
+    """The varied option, and the lines."""
 
     by: str
     lines: tuple[_Line, ...]

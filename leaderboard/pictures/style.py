@@ -43,7 +43,7 @@ def style(index: int) -> Style:
 
 
 def of(entry: EntryResults, index: int) -> Style:
-    """Return an entry's own style where it has one, else that of its place in the legend."""
+    """Return an entry's own style if it has one, else the style of its place in the legend."""
     return style(index if entry.color is None else entry.color)
 
 
@@ -64,7 +64,7 @@ def label(entry: EntryResults) -> str:
 
 
 def plain(text: str, longest: int = 60) -> str:
-    """Return text that matplotlib draws as it is: no mathematics, no control characters, and not too long."""
+    """Return text that matplotlib draws literally: no mathematics, no control characters, and not too long."""
     visible = "".join(c if c.isprintable() else "?" for c in text)
     short = visible if len(visible) <= longest else f"{visible[: longest - 3]}..."
     return short.replace("$", r"\$")
@@ -84,7 +84,7 @@ def relative(entries: Sequence[EntryResults]) -> bool:
 
 
 def score_name(entries: Sequence[EntryResults]) -> str:
-    """Return what an axis of learning curves is called: `validation score`, or the metric's name in its place.
+    """Return the title of an axis of learning curves: `validation score`, or the metric's name instead of `score`.
 
     Scores that another program wrote may be of training: no axis with such curves says `validation`.
     """
@@ -101,7 +101,7 @@ def tidy(axes: Axes) -> None:
 
 
 def labels(entries: Sequence[EntryResults], longest: int = 60) -> list[str]:
-    """Return what legends call entries: without the algorithm where all share it, never twice the same.
+    """Return unique names of entries for legends: without the algorithm if all share it.
 
     An ansatz that no option chose is named where there is room for it.
     """
@@ -120,13 +120,13 @@ def labels(entries: Sequence[EntryResults], longest: int = 60) -> list[str]:
 
 
 def facts(entry: EntryResults) -> str:
-    """Write parameters, where they are known, and seeds: `73 + 240 parameters, 100 seeds`."""
+    """Write parameters, if known, and seeds: `73 + 240 parameters, 100 seeds`."""
     known = entry.parameters_text()
     return seeds_text(entry) if known == "-" else f"{known} parameters, {seeds_text(entry)}"
 
 
 def heading(entries: Sequence[EntryResults]) -> str:
-    """Return what entries have in common: the task, and the algorithm where it is one."""
+    """Return the common facts of entries: the task, and the algorithm if all share it."""
     tasks, algorithms = (
         {getattr(entry, attribute) for entry in entries} for attribute in ("task", "algorithm")
     )

@@ -1,4 +1,4 @@
-"""Circuits written once, run on every backend: `ansatz`, `expectations`, and what circuits are made of.
+"""Circuits written once, run on every backend: `ansatz`, `expectations`, and the parts of circuits.
 
 Importing this package imports numpy and nothing heavier; registry, torch and simulators load when called.
 """

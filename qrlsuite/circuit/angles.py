@@ -1,7 +1,7 @@
 """All angles of a circuit at once, in torch: `constant + scale * input + weight` for S seeds and B inputs.
 
 Backends that hand angles to somebody else's simulator compute them here, so that gradients of inputs, scales
-and weights follow from those of the angles by autograd.
+and weights follow from the gradients of angles by autograd.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ Options = TypeVar("Options")
 
 
 class CircuitBackend(Protocol):
-    """What `factory(circuit, options)` of a `CircuitBackendSpec` returns.
+    """The result of `factory(circuit, options)` of a `CircuitBackendSpec`.
 
     A backend evaluates one circuit for S seeds (agents with their own parameters) and B inputs each. Seeds
     must not influence each other: slice s of the result depends on slice s of the arguments alone, bitwise.
@@ -56,21 +56,21 @@ class CircuitBackend(Protocol):
     draws (bool):
         Whether results are random, so that `seeds` are needed; by default where `shots` is finite.
     gradient_circuits (int):
-        Circuits that it executes per input for a gradient; by default those of the parameter-shift rule. They are
-        counted where `draws` is true; of an exact simulator the rule's are, so that entries can be compared.
+        Circuits that it executes per input for a gradient; by default the number of the parameter-shift rule. They
+        count if `draws` is true; for an exact simulator the rule's number counts, so that entries can be compared.
     simulator (bool):
         False where circuits run on a device, whose executions may cost money; by default true.
     terms (callable):
-        Of a device: `terms(circuits)` says in words what waits there, and what a number of circuits costs. It
-        executes nothing.
+        For a device: `terms(circuits)` returns its queue and the price of a number of circuits, in words. It executes
+        nothing.
     repeats (int):
         Circuits that are executed in place of each, to mitigate errors; by default 1.
     states (callable):
-        Of a simulator: `states(inputs, parameters)` returns the final states (S, B, 2^n), up to a global phase, without
-        shots and noise; qubit 0 is the highest bit of a basis state's index.
+        For a simulator: `states(inputs, parameters)` returns the final states (S, B, 2^n), up to a global phase,
+        without shots and noise; qubit 0 is the highest bit of a basis state's index.
     compile_for (callable):
-        Of a simulator: `compile_for(like)` compiles what the first passes on tensors of the dtype and device of
-        `like` would compile. It is called before training, so that no epoch's time holds it.
+        For a simulator: `compile_for(like)` compiles all code for passes on tensors of the dtype and device of `like`.
+        It is called before training, so that no epoch's time includes it.
     """
 
     shots: int | None
@@ -148,7 +148,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
 
 
 def options_on(of_model: type[Options], backend: str) -> type[Options]:
-    """Return the options of a circuit model and those of the backend that computes its circuits, as one class.
+    """Return one class with the options of a circuit model and of the backend that computes its circuits.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
 
 
 class _Whole:
-    """A backend made of those of a circuit's parts; products of inputs are further inputs of theirs.
+    """A backend made of the backends of a circuit's parts; products of inputs are further inputs of the parts.
 
     Parts are measurement bases and, where the backend takes no more at once, qubits that nothing connects.
     """
@@ -270,7 +270,7 @@ class _Whole:
 
 
 def _part_seed(seed: int, part: int) -> int:
-    """Return the seed of what is sampled in one part: independent of the others'."""
+    """Return the seed of one part's samples, independent of other parts' seeds."""
     return int(np.random.SeedSequence((seed, part)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
@@ -376,7 +376,7 @@ PREPARED = 8
 
 
 def _prepare(name: str, circuit: Circuit, options: Mapping[str, Any]) -> CircuitBackend:
-    """Return a backend for a circuit: one made before if backend, options and the circuit's content are the same."""
+    """Return a backend for a circuit; an earlier one if backend, options and the circuit's content are equal."""
     spec, chosen = _backend(name, circuit, options)
     size = circuit.qubits, circuit.inputs, circuit.mean_field
     content = (*size, *circuit.parameters.values(), *circuit, circuit.observables)
@@ -404,12 +404,12 @@ def expectations(
 ) -> torch.Tensor:
     """Compute a circuit's expectation values for a batch of inputs.
 
-    The last few circuits are kept prepared, so that only the first call with a circuit compiles it.
+    The last few circuits stay prepared, so that only the first call with a circuit compiles it.
 
     Parameters
     ----------
     circuit:
-        What to run.
+        The circuit to run.
     inputs:
         (B, circuit.inputs), finite.
     parameters:
@@ -417,7 +417,7 @@ def expectations(
     backend:
         Name of a registered circuit backend; by default `native` where it is registered, else `pennylane`.
     dtype:
-        float32 or float64; by default that of `inputs` if it is one of them, else float64.
+        float32 or float64; by default the dtype of `inputs` if it is one of these, else float64.
     seed:
         Seed of the sampling where the options ask for a finite number of shots; None draws fresh entropy.
     backend_options:

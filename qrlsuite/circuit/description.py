@@ -77,7 +77,7 @@ ISING: dict[str, tuple[tuple[str, tuple[float, ...]], ...]] = {
     "RZZ": (),
 }
 """Rotations exp(-i a PP / 2) of two qubits, which `Circuit.append` writes as CNOT, RZ, CNOT (as one controlled rotation
-in a mean-field approximation): by what turns both qubits before, and back after."""
+in a mean-field approximation): the gates that turn both qubits before, and back after."""
 
 CONTROLLED: dict[str, tuple[float, float, float]] = {
     "Y": (math.pi, math.pi / 2, math.pi / 2),
@@ -111,7 +111,7 @@ Observable = int | tuple[int, ...] | str
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What `Circuit.measure_mid` finds in a qubit, 0 or 1: a control of later gates, or an observable (1 or -1)."""
+    """The result of `Circuit.measure_mid`, 0 or 1: a control of later gates, or an observable (1 or -1)."""
 
     number: int
 
@@ -217,7 +217,7 @@ class Angle:
 
     @property
     def _parameter(self) -> Element | None:
-        """The one parameter of which this is a multiple, and nothing else."""
+        """The parameter if this is a multiple of one parameter alone."""
         alone = self.input is None and self.constant == 0.0 and (self.scale is None) != (self.weight is None)
         return (self.scale or self.weight) if alone else None
 
@@ -285,7 +285,7 @@ class Circuit:
     Attributes
     ----------
     qubits:
-        How many there are, those included that stand for earlier measurements and resets.
+        Number of qubits, with those that stand for earlier measurements and resets.
     deferred:
         How many of them do, the last ones: one for every measured qubit that is used again, and one for every reset.
 
@@ -318,7 +318,7 @@ class Circuit:
 
     @property
     def observables(self) -> tuple[Observable, ...]:
-        """What is measured, in output order, as `measure` takes it."""
+        """The observables in output order, as arguments of `measure`."""
         return tuple(map(_observable, self._resolved()))
 
     @property
@@ -338,7 +338,7 @@ class Circuit:
 
     @property
     def measures_z(self) -> bool:
-        """Whether every observable is a Pauli Z, or a product of them: what a backend is given."""
+        """Whether every observable is a Pauli Z, or a product of Pauli Z, as backends need it."""
         return all(set(axes) == {"Z"} for axes in self.axes)
 
     def _resolved(self) -> list[tuple[tuple[str, int], ...]]:
@@ -356,8 +356,8 @@ class Circuit:
     def measure_mid(self, qubit: int, postselect: None = None) -> Outcome:
         """Measure a qubit now, and go on.
 
-        The measurement is deferred to the end: where the qubit is used again, a CNOT copies the outcome to a further
-        qubit first.
+        The measurement is deferred to the end: if the qubit is used again, a CNOT copies the outcome to a further qubit
+        first.
 
         Parameters
         ----------
@@ -369,8 +369,7 @@ class Circuit:
         Returns
         -------
         Outcome
-            What is found. `append("X", 1, control=outcome)` applies a gate where it is 1, and `measure([outcome])`
-            measures it.
+            The result. `append("X", 1, control=outcome)` applies a gate if it is 1, `measure([outcome])` measures it.
 
         Raises
         ------
@@ -424,7 +423,7 @@ class Circuit:
             self._measured.remove(wire)
 
     def _keep_for(self, words: Iterable[Word]) -> None:
-        """Copy outcomes from wires of which observables are another Pauli than Z."""
+        """Copy outcomes from wires whose observables are another Pauli than Z."""
         self._keep(self._wire(of) for word in words for axis, of in word if axis != "Z")
 
     def measure(self, observables: Sequence[int | Outcome | Sequence[int | Outcome] | str]) -> None:
@@ -433,9 +432,9 @@ class Circuit:
         Parameters
         ----------
         observables:
-            A qubit or an outcome stands for its Pauli Z, several for the product of theirs, and a text for any product
-            of Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. What no common basis measures
-            is executed apart, see `in_bases`.
+            A qubit or an outcome stands for its Pauli Z, several for the product of their Pauli Z, and a text for any
+            product of Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. Observables without a
+            common basis are executed apart, see `in_bases`.
 
         Raises
         ------
@@ -502,7 +501,7 @@ class Circuit:
         angles:
             As many as the gate takes, in radians.
         control:
-            Apply the gate, which is on one qubit, only where this qubit, or what `measure_mid` found, is 1.
+            Apply the gate, which is on one qubit, only if this qubit, or this outcome of `measure_mid`, is 1.
         """
         if gate in ISING:
             self._append_ising(gate, wires, angles, control)
@@ -622,7 +621,7 @@ class Circuit:
 
 
 def _factors(observable: Any) -> Word:
-    """Return the Paulis of an observable and what they are of; none for what is no observable."""
+    """Return the Paulis of an observable with their qubits or outcomes; empty if it is no observable."""
     if isinstance(observable, str):
         found = [_FACTOR.fullmatch(part) for part in re.split(r"[*@]|(?<=\d)\s+(?=[XYZ])", observable)]
         return tuple((each[1], int(each[2])) for each in found if each) if all(found) else ()
@@ -644,7 +643,7 @@ _TURNS: dict[str, tuple[tuple[str, tuple[float, ...]], ...]] = {
     "Y": (("RX", (math.pi / 2,)),),
     "Z": (),
 }
-"""The gates after which Pauli Z is what this Pauli was before."""
+"""The gates that turn a Pauli into Pauli Z."""
 
 
 def in_bases(circuit: Circuit) -> list[tuple[Circuit, tuple[int, ...]]]:

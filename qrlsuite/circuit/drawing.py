@@ -42,7 +42,7 @@ def draw_text(circuit: Circuit, angles: bool = False) -> str:
     Parameters
     ----------
     circuit:
-        What to draw.
+        The circuit to draw.
     angles:
         Write every angle into its gate; otherwise gates carry their name alone.
     """
@@ -95,7 +95,7 @@ def _columns(circuit: Circuit) -> list[int]:
 
 
 def _label(operation: Operation, angles: bool) -> str:
-    """Return what is written into a gate's box."""
+    """Return the text in a gate's box."""
     if not angles or not operation.angles:
         return operation.gate
     return f"{operation.gate}({', '.join(angle_text(angle) for angle in operation.angles)})"

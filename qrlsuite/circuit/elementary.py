@@ -1,7 +1,7 @@
 """A circuit in elementary gates: rotations about one axis, and fixed gates on one or two qubits.
 
-This is what devices execute and what noise acts on. Every simulator with noise runs this list, so that the same noise
-rates mean the same thing everywhere. Controlled rotations become rotations and CNOTs (Nielsen & Chuang 2010,
+Devices execute these gates, and noise acts on them. Every simulator with noise runs this list, so that noise rates have
+one meaning everywhere. Controlled rotations become rotations and CNOTs (Nielsen & Chuang 2010,
 corollary 4.2); each elementary angle is a sum of at most a few angles of the circuit, times a factor.
 """
 

@@ -1,4 +1,4 @@
-"""What counts as an execution of a circuit."""
+"""Counts executions of circuits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ExecutionCounter:
         gradients taken, as on hardware: per input two for every variable angle of an uncontrolled rotation, four for
         one of a controlled rotation.
     per_gradient:
-        The number of these circuits for the gradient at one input.
+        The number of circuits for the gradient at one input.
     mean_field:
         Whether the model is a mean-field approximation, which is no circuit and executes none.
     bases:

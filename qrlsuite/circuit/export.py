@@ -1,7 +1,7 @@
 """Circuits as text for others: OpenQASM 3, and programs that build them with Qiskit or PennyLane.
 
-Inputs are `x`, parameters keep their names; every angle stays the formula that it is. The order of qubits, and what is
-measured, are those of the description.
+Inputs are `x`, parameters keep their names; every angle stays a formula. The order of qubits and the observables are
+the description's.
 """
 
 from __future__ import annotations
@@ -170,4 +170,4 @@ def _shape(shape: tuple[int, ...]) -> str:
 
 
 FORMATS: dict[str, Callable[[Circuit], str]] = {"qasm3": _qasm3, "qiskit": _qiskit, "pennylane": _pennylane}
-"""What `export` can write."""
+"""Formats of `export`."""

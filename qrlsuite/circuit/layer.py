@@ -42,9 +42,9 @@ def layer(
     circuit:
         Name of an ansatz (`qrlsuite list ansatzes`), or a circuit of your own.
     qubits, layers:
-        Size of the circuit, where a name is given.
+        Size of the circuit, if a name is given.
     backend:
-        What computes it (`qrlsuite list circuit_backends`); `native` is the fast simulator.
+        Backend that computes it (`qrlsuite list circuit_backends`); `native` is the fast simulator.
     backend_options:
         Options of the backend, such as `{"shots": 1000}`.
     generator:
@@ -139,7 +139,7 @@ class CircuitLayer(nn.Module):
         return values[0].reshape(shape).to(inputs.dtype)
 
     def extra_repr(self) -> str:
-        """Say what the circuit is, in the layer's printed form."""
+        """Describe the circuit in the layer's printed form."""
         return (
             f"qubits={self.description.qubits}, in_features={self.in_features}, out_features={self.out_features}, "
             f"backend='{self.backend_name}'"

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class CircuitModel(Protocol):
-    """What `build` and `population` of a model with a circuit return, beside a `torch.nn.Module`.
+    """Attributes of a model with a circuit, which `build` and `population` return, beside `torch.nn.Module`'s.
 
     The suite recognizes such a network by these attributes: it counts executions, prepares the circuit before the first
     epoch, evaluates the agents on other backends and diagnoses them. A network that has `executions` must
@@ -36,7 +36,7 @@ class CircuitModel(Protocol):
         ...
 
     def compile_circuits(self) -> None:
-        """Compile what the first pass would, if there is something to compile; executes nothing on a device."""
+        """Compile the code of the first pass, if there is any to compile; executes nothing on a device."""
         ...
 
     def circuit_states(self, x: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What circuits take: gates, depths, and executions for gradients on hardware."""
+"""Resources of circuits: gates, depths, and executions for gradients on hardware."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ def jacobian_rank(circuit: Circuit, seed: int = 0) -> int | None:
     """Return how many directions of its parameters change what a circuit computes, to first order.
 
     It is the rank of the Jacobian of all expectation values by all parameters, at random parameters as they are drawn
-    initially and at more than enough random inputs of a standard normal distribution. What is missing to the number of
-    parameters are scalars without effect, such as a last RZ, and those that others can stand for.
+    initially and at more than enough random inputs of a standard normal distribution. The rest of the parameters are
+    scalars without effect, such as a last RZ, and scalars that others can replace.
 
     Parameters
     ----------
     seed:
-        Of the random parameters and inputs.
+        Seed of the random parameters and inputs.
 
     Returns
     -------

@@ -41,8 +41,8 @@ the parts of the backward pass; each draws its own samples."""
 
 Combine = Callable[[Tensor, Tensor], Tensor]
 Rule = Callable[[Tensor], tuple[Tensor, Combine]]
-"""From angles (A, B) to the angles of K evaluations (A, K * B), and what combines their values (K * B, O) and a
-cotangent (B, O) to the gradient (A, B)."""
+"""From angles (A, B) to the angles of K evaluations (A, K * B), and a function that combines their values (K * B, O)
+and a cotangent (B, O) to the gradient (A, B)."""
 
 
 class ShiftPlan(NamedTuple):
@@ -102,7 +102,7 @@ def stream(entropy: Any, *path: int) -> np.random.SeedSequence:
 
 
 def random_signs(seed: np.random.SeedSequence) -> Callable[[tuple[int, ...]], Tensor]:
-    """Return what draws tensors of +1 and -1."""
+    """Return a function that draws tensors of +1 and -1."""
     source = np.random.default_rng(seed)
     return lambda shape: torch.from_numpy(source.choice([-1.0, 1.0], shape))
 
@@ -140,7 +140,7 @@ def measured(angles: Tensor, execute: Execute, rule: Rule, most: int = 2**62) ->
     angles:
         (A, B) radians.
     execute:
-        What runs circuits.
+        Runs circuits.
     rule:
         How to differentiate.
     most:

@@ -29,7 +29,7 @@ from qrlsuite.compiled.vectors import (
 )
 
 NOTHING, RELU, SINE, WHERE_POSITIVE, TIMES = range(5)
-"""What follows a product, see `_finish`."""
+"""Operations after a product, see `_finish`."""
 
 
 def record_rows(sizes: Sequence[int], activation: int, lanes: int) -> int:
@@ -44,8 +44,8 @@ def _multiply(
 ) -> None:  # fmt: skip
     """Write rows `to + r` of target: bias[at + r] + sum over k of matrix[first + r row + k column] source[begin + k].
 
-    There is no bias where `at` is below 0. What follows, see `_finish`, may use row `other + r` of `kept`. Rows have
-    two vectors, the second is computed if `both`.
+    There is no bias if `at` is below 0. The operation after it, see `_finish`, may use row `other + r` of `kept`. Rows
+    have two vectors, the second is computed if `both`.
     """
     full = rows - rows % 4
     for r in range(0, full, 4):
@@ -92,7 +92,7 @@ def _multiply(
 
 @inlined
 def _finish(target: Any, to: int, a: Any, b: Any, how: int, kept: Any, other: int) -> None:
-    """Write one row of two vectors after what `how` says, with row `other` of `kept`.
+    """Write one row of two vectors after the operation `how`, with row `other` of `kept`.
 
     In `forward` RELU or SINE, whose derivative goes to that row; in `backward` WHERE_POSITIVE or TIMES that row.
     """

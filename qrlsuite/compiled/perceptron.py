@@ -121,14 +121,14 @@ class Sweep:
             tensor.grad = part
 
     def gradients_of(self, parameters: Sequence[Tensor]) -> Array | None:
-        """Return the gradients of all parameters, if these are they and have those that `set_gradients` wrote."""
+        """Return all parameters' gradients, if the arguments are these parameters with gradients of `set_gradients`."""
         if len(parameters) != len(self._kept_parts):
             return None
         same = zip(parameters, self.tensors, self._kept_parts)
         return self.kept_gradients if all(p is own and p.grad is part for p, own, part in same) else None
 
     def pull(self, records: _Records, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
-        """Write the gradients of the parameters, laid out as these, of cotangents (S, B, out), and that of x."""
+        """Write the gradients of the parameters (in their layout) and of x, given cotangents (S, B, out)."""
         pair, turned, sums = (_Records(*shape) for shape in self.shapes_of_work)
         networks.backward(
             cotangents,

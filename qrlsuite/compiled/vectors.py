@@ -31,7 +31,7 @@ intrinsic: Any = extending.intrinsic
 
 
 def _target() -> tuple[int, bool]:
-    """Return what numba compiles for: bytes of a vector register, and whether it fuses a * b + c.
+    """Return facts on numba's target: bytes of a vector register, and whether it fuses a * b + c.
 
     Both are read off the assembly of one multiplication and addition of 16 floats.
     """

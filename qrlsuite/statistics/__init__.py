@@ -1,4 +1,4 @@
-"""Sample complexity, its confidence intervals, and tests of which entry needs less.
+"""Sample complexity, its confidence intervals, and tests for a difference between entries.
 
 Arrays in, arrays out: learning curves are (N runs, T epochs), results are (E epsilons, D deltas). Nothing
 here knows about tasks, stores or commands, and importing it costs no more than numpy.

@@ -83,9 +83,9 @@ def across_tasks(scores: Scores, alpha: float = 0.05, n_resamples: int = 2000, s
     alpha:
         In (0, 1).
     n_resamples:
-        Of the bootstrap.
+        Number of bootstrap resamples.
     seed:
-        Of bootstrap and relabelings.
+        Seed of bootstrap and relabelings.
 
     Raises
     ------
@@ -268,15 +268,15 @@ class MeanRatio:
 def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) -> MeanRatio:
     """Compare two entries on average over tasks, by the log ratios of their mean times.
 
-    The error of each task's log ratio is that of the delta method; the mean's has Welch and Satterthwaite's degrees of
-    freedom.
+    The error of each task's log ratio follows from the delta method; the error of the mean has Welch and
+    Satterthwaite's degrees of freedom.
 
     Parameters
     ----------
     pairs:
-        Of each of two or more tasks the times of the first and the second entry, (N, E): as of `times_below`.
+        Times of the first and the second entry on each of two or more tasks, (N, E): results of `times_below`.
     level:
-        Of the interval.
+        Level of the interval.
 
     Raises
     ------

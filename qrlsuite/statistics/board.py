@@ -39,7 +39,7 @@ class Board:
     not_reached:
         Shape (M,): whether S_hat is the horizon in every cell.
     evidence:
-        By entry and number of runs, what the verdicts rest on, where all entries were judged at one horizon.
+        The evidence of verdicts by entry and number of runs, if all entries were judged at one horizon.
     """
 
     names: tuple[str, ...]

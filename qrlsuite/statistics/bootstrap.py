@@ -28,7 +28,7 @@ EpochDraws = NDArray[np.int32]
 RESAMPLES = 1000
 """How often runs are redrawn, unless a caller says otherwise."""
 PERCENTILES = (5.0, 95.0)
-"""Ends of an interval of S_hat, where it is shown and where verdicts compare it."""
+"""Ends of an interval of S_hat, both in pictures and in verdicts."""
 BLOCK = 2048  # resamples at a time: a block of counts stays in the cache
 BYTE = 255  # the most that a byte can count
 _TILE = 2**18  # rows x columns x depth up to which OpenBLAS multiplies float32 matrices on one thread

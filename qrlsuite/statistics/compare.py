@@ -180,7 +180,7 @@ def never_reached(entry: LearningCurves, grid: Grid) -> bool:
 
 
 def shown_percentiles(rule: SignificanceRule) -> tuple[float, float]:
-    """Return the percentiles of the intervals that are shown beside a rule's verdicts."""
+    """Return the percentiles of the intervals beside a rule's verdicts."""
     return rule.percentiles if isinstance(rule, IntervalRule) else PERCENTILES
 
 
@@ -235,7 +235,7 @@ def compare(
 def judge_cells(
     rule: SignificanceRule, first: Evidence, others: Sequence[Evidence], horizon: int
 ) -> tuple[Signs, BoolArray]:
-    """Judge one entry against M others, cell by cell: what every verdict of a pair is made of.
+    """Judge one entry against M others, cell by cell; verdicts of pairs follow from these signs.
 
     Returns
     -------

@@ -25,7 +25,7 @@ def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") 
     relative:
         Whether scores are fractions of a known maximum, in [0, 1].
     name:
-        What to call the curves in an error message.
+        Name of the curves in an error message.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class LearningCurves:
     steps_per_epoch:
         Environment steps between two validations.
     name:
-        What to call the entry in sentences and rankings.
+        Name of the entry in sentences and rankings.
 
     Raises
     ------

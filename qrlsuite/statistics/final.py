@@ -55,8 +55,8 @@ class ScoreBoard:
     mean_interval, interquartile_interval:
         Shape (M, 2): percentiles of the bootstrap, at level 1 - alpha for each entry by itself.
     difference, difference_interval:
-        Shape (M, M) and (M, M, 2): mean of the row's entry minus that of the column's; Welch's t at level 1 - alpha
-        for each pair by itself.
+        Shape (M, M) and (M, M, 2): mean of the row's entry minus mean of the column's; Welch's t at level 1 - alpha for
+        each pair by itself.
     improvement:
         Shape (M, M): probability that a run of the row's entry scores more than one of the column's; ties count half.
     p, adjusted:

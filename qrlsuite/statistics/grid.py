@@ -70,7 +70,7 @@ def exact(value: object, name: str) -> Decimal:
 
 
 def settled(scores: ArrayLike) -> FloatArray:
-    """Round scores to 7 decimals, and those below 1e-4 to 7 digits: the noise of means of float32 scores disappears.
+    """Round scores to 7 decimals, and scores below 1e-4 to 7 digits: the noise of means of float32 scores disappears.
 
     A hundred float32 scores of 0.95 have the mean 0.949999988.
 
@@ -188,7 +188,7 @@ class Grid:
 
     @property
     def level_name(self) -> str:
-        """`epsilon` or `threshold`: what `levels` are."""
+        """Kind of `levels`: `epsilon` or `threshold`."""
         return "threshold" if self.epsilons is None else "epsilon"
 
     @property

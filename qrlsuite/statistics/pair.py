@@ -1,6 +1,6 @@
 """One pair by its times below threshold: the verdict of the pair, and every threshold with an interval of its own.
 
-The verdict is that of a board of these two (`times_board`): the max-T permutation test at level alpha.
+The verdict equals the verdict of a board of these two (`times_board`): the max-T permutation test at level alpha.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class TimesPair:
     direction:
         The verdict; undecided where an entry has fewer than 20 runs.
     p:
-        Of the pair, NaN where undecided.
+        p of the pair, NaN if undecided.
     difference:
-        Shape (3,): mean time of the first over that of the second, minus 1, and its interval at level 1 - alpha.
-        NaN where the second's is 0, the interval where an entry has a single run.
+        Shape (3,): mean time of the first over mean time of the second, minus 1, and its interval at level 1 - alpha.
+        NaN if the second's is 0; the interval is NaN if an entry has a single run.
     signs:
         Shape (E,): +1 where the first needs significantly fewer steps, -1 where more, at level alpha for all
         thresholds together.

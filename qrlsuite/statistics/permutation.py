@@ -1,7 +1,7 @@
 """Permutation tests of one pair: labels of whole runs exchanged, one critical value for all comparisons.
 
 If two entries follow the same law, any assignment of the labels "first" and "second" to their runs is as likely
-as the observed one. The observed statistic is therefore compared with those of R random relabelings,
+as the observed one. The observed statistic is therefore compared with the statistics of R random relabelings,
 
     p = (1 + number of relabelings whose statistic is at least as large) / (R + 1),
 
@@ -12,7 +12,7 @@ where the maxima rarely reach its own |t|. The t are studentized: with equal mea
 is still valid for many runs (Janssen 1997, Statistics & Probability Letters 36; Chung and Romano 2013, Annals of
 Statistics 41).
 
-Two rules are built on it: `TimesRule`, and `SkewedTimesRule` for entries of which some runs fail.
+Two rules are built on it: `TimesRule`, and `SkewedTimesRule` for entries with some failing runs.
 """
 
 from __future__ import annotations
@@ -148,12 +148,12 @@ class MaxT:
 
     @property
     def p(self) -> FloatArray:
-        """Shape (P,): p of every pair, that of its largest |t|."""
+        """Shape (P,): p of every pair, the p of its largest |t|."""
         smallest: FloatArray = self.p_each.min(axis=1, initial=1)
         return smallest
 
     def extend(self, n_relabelings: int, which: IntArray | None = None) -> None:
-        """Continue to `n_relabelings` (a multiple of 10,000), for all pairs or for those in `which`."""
+        """Continue to `n_relabelings` (a multiple of 10,000), for all pairs or the pairs in `which`."""
         chosen = range(len(self._pairs)) if which is None else which.tolist()
         groups: dict[tuple[Blocks, int], list[int]] = {}
         for index in chosen:
@@ -250,7 +250,7 @@ def _hall(first: _Cumulants, second: _Cumulants) -> FloatArray:
 
 
 class _Statistics:
-    """A strictly increasing function of |t|, for P pairs of equal sizes: what relabelings are compared by.
+    """The statistic of relabelings: a strictly increasing function of |t|, for P pairs of equal sizes.
 
     For equal numbers of runs, with sum of squares and total of both entries together, t is an increasing
     function of the difference alone: (sum_A - sum_B)^2 / (n x squares - total^2), which lies in [0, 1]. For
@@ -281,7 +281,7 @@ class _Statistics:
         self.observed = self._of(observed).reshape(self.n_comparisons, self.n_pairs)
 
     def _powers(self, rows: IntArray) -> list[NDArray[Any]]:
-        """Return the powers of the runs of which sums are needed."""
+        """Return the powers of the runs whose sums are needed."""
         return [rows] if self.equal else [rows, rows**2]
 
     def count(self, chunk: int, seed: int) -> IntArray:
@@ -426,7 +426,7 @@ class TimesRule:
 
 @dataclass(frozen=True, slots=True)
 class SkewedTimesRule(TimesRule):
-    """`TimesRule` with a t that is corrected for skewness (`skewed_t`), for entries of which some runs fail."""
+    """`TimesRule` with a t that is corrected for skewness (`skewed_t`), for entries with some failing runs."""
 
     @property
     def name(self) -> str:

@@ -1,7 +1,7 @@
 """How many runs it takes to tell two entries apart: by rule `times`, all at once or with looks.
 
-Entries are drawn from smoothed models of pilot runs, or of a published entry that is alike (`SmoothedRuns`), and
-judged as they would be. What comes out holds for entries like the pilot, within the simulation's error.
+Entries are drawn from smoothed models of pilot runs, or of a similar published entry (`SmoothedRuns`), and judged like
+real ones. The result holds for entries like the pilot, within the simulation's error.
 """
 
 from __future__ import annotations
@@ -63,21 +63,21 @@ def runs_needed(
     Parameters
     ----------
     first, second:
-        What the entries are drawn from; the first should be the better one.
+        Models from which entries are drawn; the first should be the better one.
     grid:
         Its E thresholds count; its deltas do not.
     powers:
         In (0, 1).
     alpha:
-        Of the test and of the design.
+        Error of the test and of the design.
     most:
         Runs of an entry that are allowed at most, 20 or more.
     spending:
-        Of the design.
+        Spending function of the design.
     n_pairs:
         Simulated pairs: the power at each number of runs has a standard error of sqrt(power (1 - power) / n_pairs).
     seed:
-        Of the simulation.
+        Seed of the simulation.
 
     Raises
     ------

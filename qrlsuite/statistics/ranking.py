@@ -6,7 +6,7 @@ tier; tier = 1 + the length of the longest chain of components above. Adjacent t
 member of the upper one outperforms a given member of the lower one.
 
 A tier is as firm as the narrowest win in the chain above it: each place names that win. Entries that never
-reached the goal of any cell have no tier: nothing is known of how long they would take.
+reached the goal of any cell have no tier: the steps that they would need are unknown.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Ranking:
     tiers:
         The ranked entries, best tier first; within a tier by Copeland score, then by name.
     not_reached:
-        Entries that reached the goal of no cell within the horizon: below those that outperform them, and not
-        ranked among each other. By name.
+        Entries that reached the goal of no cell within the horizon, by name. They are below the entries that outperform
+        them, and not ranked among each other.
     undecided:
         Entries that stand apart: fewer than 20 runs, or no decided pair. By name.
     """
@@ -73,7 +73,7 @@ class Ranking:
 
     @property
     def entries(self) -> tuple[Ranked, ...]:
-        """All entries in the order of the board: tiers, those that reached no goal, and the undecided."""
+        """All entries in the order of the board: tiers, then entries that reached no goal, then undecided ones."""
         return tuple(entry for tier in self.tiers for entry in tier) + self.not_reached + self.undecided
 
 

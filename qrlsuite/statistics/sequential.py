@@ -7,7 +7,7 @@ Ye, Li, Liu and Yao 2013, Statistics in Medicine 32): every pair that is not yet
 belong to alpha / number of such pairs, and after a rejection again with one less. The family is all pairs that were
 planned. A pair that is closed as equal is not rejected: it keeps its share of alpha.
 
-The test is that of rule `times` (`MaxT`); labels are exchanged within the block of seeds that each look added.
+The test is the test of rule `times` (`MaxT`); labels are exchanged within the block of seeds that each look added.
 A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
 1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
 
@@ -35,7 +35,7 @@ from qrlsuite.statistics.times import check_probability, student_quantile, times
 from qrlsuite.statistics.times_board import direction, log_ratios
 
 RULES = ("times", "times-skewed")
-"""What may judge the pairs of a design."""
+"""Rules that may judge the pairs of a design."""
 MOST_RELABELINGS = 200_000
 """At levels below 1e-4 a decision needs p = 1 / 200,001 or so; at levels below that there is none."""
 _POINTS = 1001  # of the numerical integration
@@ -49,7 +49,7 @@ class Spending(StrEnum):
     OBRIEN_FLEMING = "obrien-fleming"
 
     def spent(self, t: Sequence[float], alpha: float) -> FloatArray:
-        """Return, shape (K,), what one side has spent at shares t in (0, 1] of the runs: alpha at t = 1."""
+        """Return, shape (K,), the error that one side has spent at shares t in (0, 1] of the runs: alpha at t = 1."""
         from scipy.special import ndtr, ndtri
 
         share = np.asarray(t, dtype=np.float64)
@@ -73,7 +73,7 @@ def nominal_levels(
     looks:
         Numbers of runs, rising.
     alpha:
-        What is spent when all are done.
+        The error spent when all runs are done.
     spending:
         The function.
     sides:
@@ -88,7 +88,7 @@ def nominal_levels(
 
 
 def _level(looks: tuple[int, ...], look: int, alpha: float, spending: Spending, sides: int) -> float:
-    """Return the level of one look, without those of the later ones."""
+    """Return the level of one look; later looks are not computed."""
     from scipy.special import ndtr
 
     bounds = [
@@ -130,7 +130,7 @@ def _going_on(
 
 
 def _share_and_step(looks: tuple[int, ...], look: int) -> tuple[float, float]:
-    """Return a look's share of all planned runs, and the standard deviation of what it adds to B."""
+    """Return a look's share of all planned runs, and the standard deviation of its increment of B."""
     shares = [0.0, *(np.array(looks) / looks[-1]).tolist()]
     return shares[look + 1], math.sqrt(shares[look + 1] - shares[look])
 
@@ -164,7 +164,7 @@ def _simpson(low: float, high: float) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class SequentialDesign:
-    """What is fixed before the first run: who is compared, when, and at which error.
+    """The plan that is fixed before the first run: pairs, looks, and error.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class SequentialDesign:
     pairs:
         The pairs of names that are compared; None means all.
     seed:
-        Of the relabelings.
+        Seed of the relabelings.
     reason:
         Why the first look comes before 20 runs.
     rule:
@@ -288,11 +288,11 @@ class PairDecision:
     p, levels:
         Max-T p and the level it was compared with last, at each look so far.
     difference:
-        Mean time of the second over that of the first, minus 1, at the last look. After an early stop it is
-        biased away from 0.
+        Mean time of the second over mean time of the first, minus 1, at the last look. After an early stop it is biased
+        away from 0.
     interval:
-        Of the difference: repeated confidence interval (Jennison and Turnbull 1989). All pairs at all looks
-        together are covered with probability about 1 - alpha, whatever made the study stop.
+        Repeated confidence interval of the difference (Jennison and Turnbull 1989). All pairs at all looks together are
+        covered with probability about 1 - alpha, whatever made the study stop.
     within_margin:
         Whether the difference is significantly smaller than the margin, either way.
     margin:
@@ -422,7 +422,7 @@ def next_look(
     studies: Sequence[Sequence[PairDecision]],
     times: Sequence[Mapping[str, IntArray]],
 ) -> list[list[PairDecision]]:
-    """Return the pairs of several studies of one design after look 0, 1, ...; closed ones stay as they are.
+    """Return the pairs of several studies of one design after look 0, 1, ...; closed pairs are unchanged.
 
     Parameters
     ----------
@@ -489,7 +489,7 @@ def _looked(
 
 
 def _led(pair: PairDecision, data: tuple[IntArray, IntArray], t: FloatArray) -> PairDecision:
-    """Return a pair with the threshold that gave it its p, and what the difference is there."""
+    """Return a pair with the threshold that gave it its p, and the difference at that threshold."""
     leading = int(np.abs(t).argmax())
     first, second = (each[:, [leading]] for each in data)
     difference, interval = _repeated((first, second), pair.levels[-1])
@@ -519,7 +519,7 @@ def _reject(
     t: FloatArray,
     p_each: FloatArray,
 ) -> None:
-    """Group-sequential Holm: decide open pairs at the level for those that are left, until none follows."""
+    """Group-sequential Holm: decide open pairs at the level for the remaining ones, until none follows."""
     strictest = design.level(look, len(pairs))
     while True:
         undecided = sum(not pair.differs for pair in pairs)

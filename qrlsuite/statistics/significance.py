@@ -2,8 +2,8 @@
 
 A rule is called with two `Evidence` objects, which are already cut to a common horizon and resampled at a
 common number of runs, and returns +1 where the first entry needs significantly fewer samples, -1 where it
-needs significantly more and 0 elsewhere. What follows from the cells (outperformance, ranking) is the same
-for every rule, see `qrlsuite.statistics.compare`.
+needs significantly more and 0 elsewhere. Outperformance and ranking follow from the cells in one way for every
+rule, see `qrlsuite.statistics.compare`.
 
 Here is the paper's, `IntervalRule`: the 5th to 95th percentile intervals do not overlap. Rules for times below
 threshold are in `qrlsuite.statistics.permutation`.

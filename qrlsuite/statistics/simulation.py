@@ -1,8 +1,8 @@
 """Simulated runs that resemble an entry's: what a comparison or a design would find, and how often.
 
 `SmoothedRuns` draws independent runs from a smoothed model of an entry's curves, at any number of runs. `judge_times`
-says what rule `times` finds in many pairs, and `decision_rates` plays whole sequential designs. How often other rules
-err is measured in `benchmarks/simulated.py`.
+returns the findings of rule `times` in many pairs, and `decision_rates` plays whole sequential designs. Error rates of
+other rules are measured in `benchmarks/simulated.py`.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def draw_times(
 
 @dataclass(frozen=True, slots=True)
 class TimesRates:
-    """How often rule `times` found what, over many simulated pairs.
+    """Rates of the findings of rule `times`, over many simulated pairs.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ class TimesRates:
 
 
 def judge_times(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> TimesRates:
-    """Return what rule `times` finds in P pairs of times, (P, N_A, E) and (P, N_B, E)."""
+    """Return the rates of the findings of rule `times` in P pairs of times, (P, N_A, E) and (P, N_B, E)."""
     test = MaxT(list(zip(ours, theirs)))
     test.extend(relabelings_for(alpha))
     signs = np.where(test.p_each <= alpha, np.sign(test.t), 0)
@@ -155,7 +155,7 @@ def judge_times(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> TimesR
 
 @dataclass(frozen=True, slots=True)
 class DecisionRates:
-    """What a sequential design comes to, over many simulated studies.
+    """Rates of a sequential design's decisions, over many simulated studies.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ def decision_rates(
 
 
 def play(design: SequentialDesign, drawn: Sequence[IntArray]) -> DecisionRates:
-    """Return what a design comes to on times of each entry, (studies, N, E) with N the runs of the last look."""
+    """Return a design's rates on times of each entry, (studies, N, E) with N the runs of the last look."""
     count = len(drawn[0])
     times = [{name: each[k] for name, each in zip(design.entries, drawn)} for k in range(count)]
     studies = [list(begin(design)) for _ in range(count)]

@@ -54,7 +54,7 @@ def times_below(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray
 
 
 def times_lost(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray:
-    """Return, shape (N, E), the part of `times_below` after each threshold was first reached: what was forgotten.
+    """Return, shape (N, E), the forgotten part of `times_below`: the steps after each threshold was first reached.
 
     It is 0 for a run that never loses a threshold again, and for one that never reaches it.
 

@@ -53,14 +53,14 @@ class TimesBoard:
     p:
         Shape (M, M): max-T p of each pair by itself; NaN where undecided, and on the diagonal.
     adjusted:
-        Shape (M, M): the same, adjusted for all pairs of the board (Holm 1979).
+        Shape (M, M): p adjusted for all pairs of the board (Holm 1979).
     directions:
-        M rows of M: what is decided.
+        M rows of M: the decisions.
     signs:
         Shape (M, M, E): +1 where the row's entry needs significantly fewer steps at this threshold, at level
         alpha / number of pairs; -1 where more.
     difference:
-        Shape (M, M): M of the row's entry over that of the column's, minus 1; NaN where the latter is 0.
+        Shape (M, M): M of the row's entry over M of the column's, minus 1; NaN if the latter is 0.
     difference_interval:
         Shape (M, M, 2): at level 1 - alpha for each pair by itself (Welch's t of the log ratio, delta method).
     ranks:
@@ -85,7 +85,7 @@ class TimesBoard:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Indices of the ranked entries by M, least first, equal ones by name; then those below 20 runs."""
+        """Indices of the ranked entries by M, least first, equal ones by name; then entries below 20 runs."""
         return self._by([mean.mean for mean in self.means])
 
     @property
@@ -135,7 +135,7 @@ def times_board(
     horizon:
         Environment steps beyond which no entry is looked at; None means the horizon that all have.
     seed:
-        Of the relabelings.
+        Seed of the relabelings.
 
     Raises
     ------
@@ -252,7 +252,7 @@ def direction(t: FloatArray, signs: IntArray) -> int:
 
 
 def named_direction(sign: int | None) -> Direction:
-    """Return what the sign of a decided pair means, see `direction`; None is a pair that is not decided."""
+    """Return the direction of a decided pair's sign, see `direction`; None is an undecided pair."""
     if sign is None:
         return Direction.NOT_TOLD_APART
     return {1: Direction.FEWER, -1: Direction.MORE, 0: Direction.TRADE_OFF}[sign]
