@@ -140,12 +140,12 @@ def check(study: Study) -> None:
 def read(selection: Selection, members: Sequence[Member]) -> dict[str, EntryResults]:
     """Return the learning curves of the entries that have any, by entry name; seeds kept for tuning are left out.
 
-    Of an entry that comes with the suite, too, the copy that gets further is read, then that with more seeds.
+    Those of an entry that comes with the suite, too, are added, see `collect.united`.
     """
     curves_by_name = {}
     for entry in {member.entry.name: member.entry for member in members}.values():
         if copies := _copies(selection.folders, entry):
-            curves_by_name[entry.name] = collect.best(copies)
+            curves_by_name[entry.name] = collect.united(copies)[0]
     return curves_by_name
 
 

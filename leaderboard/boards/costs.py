@@ -108,11 +108,11 @@ def price(entry: EntryResults, unit: str) -> Price:
     """
     if unit == "steps":
         return Price(1.0)
-    records = [record for record in entry.records.values() if record["epochs"]]
+    records = [record for record in entry.records.values() if record.epochs]
     kind = "hours" if unit == "core-hours" else "executions"
-    of_seeds = [record[kind] / (record["epochs"] * entry.steps_per_epoch) for record in records]
-    steps = sum(record["epochs"] for record in records) * entry.steps_per_epoch
-    total = sum(record[kind] for record in records)
+    of_seeds = [getattr(record, kind) / (record.epochs * entry.steps_per_epoch) for record in records]
+    steps = sum(record.epochs for record in records) * entry.steps_per_epoch
+    total = sum(getattr(record, kind) for record in records)
     if not total:
         if kind == "hours":
             return Price(math.nan, "no times in its record")

@@ -116,7 +116,7 @@ def _commands(entry: EntryResults) -> list[tuple[str, str]]:
         entry.task.partition("+")[0],
         *(word for each in changed for word in ("--set", f"environment.{each}")),
     ]
-    published = ["--published"] * (entry.source == "published")
+    published = ["--published"] * (entry.source != "runs")
     named, place = f"{entry.task}/{entry.name}", entry.folder.parts[-4:]
     lines = [("Train", ["run", entry.label, "--task", *task, "--seeds", str(len(entry.seeds))])]
     if published and place[0] == "leaderboard":

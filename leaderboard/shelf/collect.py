@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -12,10 +14,17 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameE
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf import published as published_entries
-from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
+from qrlsuite.leaderboard.shelf.curves import (
+    BESIDE,
+    DifferentCurvesError,
+    EntryResults,
+    SeedResult,
+    current,
+    require_scores,
+)
 from qrlsuite.results import codes, genuine, lookup, probes
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import ANOTHER_FOLDER, EntryStore, SeedRun, entries, parameters_of
+from qrlsuite.results.store import ANOTHER_FOLDER, EntryStore, SeedRun, entries
 
 Key = tuple[str, str]
 """An entry's task and name."""
@@ -71,8 +80,8 @@ class Selection:
 def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
     """Read every selected entry.
 
-    An entry in the results folder that is also published is shown once, as the copy with more seeds: equal seeds are
-    equal runs, not further evidence. If the own copy is shorter within the task's shortest horizon, both are shown.
+    An entry that is in the results folder and published is shown once, with the seeds of both, see `united`. Where the
+    own seeds get less far towards the task's shortest horizon, both are shown.
 
     Returns
     -------
@@ -101,33 +110,21 @@ def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
             good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
     collected = []
     for copies in (copies for same in good.values() for copies in told_apart(same)):
-        shown = _shown(copies) if selection.published else copies[-1:]
+        shown, problem = _shown(copies)
         collected += shown
-        for other in copies if selection.published and len(shown) < len(copies) else ():
-            if other is not shown[0]:
-                here, there = (
-                    f"{len(each.seeds)} seeds of {each.curves.shape[1]} epochs" for each in (other, shown[0])
-                )
-                refused.append(
-                    f"{other.folder}: {here}; shown are {there} of the same entry, from {shown[0].folder}"
-                )
+        refused += [problem] if problem else []
     return collected, refused
-
-
-BESIDE = "-published"
-"""End of a published entry's name that stands beside own runs of that entry."""
 
 
 def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
     """Return copies of an entry in lists, one for each code that trained some."""
     kinds: list[list[EntryResults]] = []
     for entry in copies:
-        for kind in kinds:
-            if kind[0].codes == entry.codes or set(kind[0].codes) & set(entry.codes):
-                kind.append(entry)
-                break
-        else:
+        same = next((kind for kind in kinds if kind[0].has_code_of(entry)), None)
+        if same is None:
             kinds.append([entry])
+        else:
+            same.append(entry)
     return kinds
 
 
@@ -141,22 +138,15 @@ def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
         return kinds
     own = [same for same in kinds if any(entry.source == "runs" for entry in same)]
     if len(own) == 1 and len(kinds) == 2:
-        return [*own, *([_as_published(each) for each in same] for same in kinds if same is not own[0])]
+        return [*own, *([each.marked(BESIDE) for each in same] for same in kinds if same is not own[0])]
     return [
         [entry.marked("@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in same]
         for same in kinds
     ]
 
 
-def _as_published(entry: EntryResults) -> EntryResults:
-    """Return a published entry with a name and a label that differ from own runs of that entry."""
-    if entry.name.endswith(BESIDE):
-        return entry
-    return replace(entry, name=f"{entry.name}{BESIDE}", label=f"{entry.label} (published)")
-
-
 def select(
-    selection: Selection, names: Iterable[str | EntryResults] = (), horizon: int | None = None
+    selection: Selection, names: Sequence[str | EntryResults] = (), horizon: int | None = None
 ) -> tuple[list[EntryResults], list[str]]:
     """Read the entries for a board or a picture.
 
@@ -172,17 +162,17 @@ def select(
     tuple
         The entries, in the order named; and one line with the reason for each entry that was left out.
     """
-    named = {
-        (copy.task_hash, copy.name): copy
-        for name in names
-        for copy in ([name] if isinstance(name, EntryResults) else _shown(read_copies(selection, name)))
-    }
-    entries, left_out = list(named.values()), list[str]()
-    if not named:
+    entries, left_out = list[EntryResults](), list[str]()
+    for name in names:
+        shown, problem = (
+            ([name], "") if isinstance(name, EntryResults) else _shown(read_copies(selection, name))
+        )
+        entries += shown
+        left_out += [*(line for entry in shown for line in entry.refused), *([problem] if problem else [])]
+    if not names:
         entries, left_out = collect(selection)
         entries = [entry for entry in entries if not selection.tasks or entry.task in selection.tasks]
-    else:
-        left_out = [line for entry in entries for line in entry.refused]
+    entries = list({(entry.task_hash, entry.name): entry for entry in entries}.values())
     if horizon is not None:
         entries, uneven = _at_whole_epochs(entries, horizon)
         left_out += uneven
@@ -248,12 +238,29 @@ def equally_long(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], l
 
 def find(selection: Selection, name: str) -> EntryResults:
     """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is."""
-    return best(read_copies(selection, name))
+    return united(read_copies(selection, name))[0]
 
 
 def best(copies: Iterable[EntryResults]) -> EntryResults:
     """Return the copy of an entry that gets furthest towards the task's shortest horizon, then that with more seeds."""
     return max(copies, key=_weight)
+
+
+def united(copies: Sequence[EntryResults]) -> tuple[EntryResults, str]:
+    """Return the union of an entry's copies; or where it cannot be, the best copy, and why.
+
+    Copies of another code are left out, and those that get less far towards the task's shortest horizon.
+    """
+    further = best(copies)
+    far = _weight(further)[0]
+    equal = [copy for copy in copies if copy.mark == further.mark and _weight(copy)[0] == far]
+    try:
+        return functools.reduce(operator.add, equal), ""
+    except DifferentCurvesError as error:
+        shown = (
+            f"{len(further.seeds)} seeds of {further.epochs} epochs of the same entry, from {further.folder}"
+        )
+        return further, f"{error}; shown are {shown}"
 
 
 def read_copies(selection: Selection, name: str) -> list[EntryResults]:
@@ -304,12 +311,11 @@ def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
     return copies
 
 
-def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
-    """Return the copies of an entry to show: the better copy, or both if the own copy is shorter."""
-    own, further = copies[0], best(copies)
-    if own.source == "runs" and _weight(own)[0] < _weight(further)[0]:
-        return [own, _as_published(further)]
-    return [further]
+def _shown(copies: Sequence[EntryResults]) -> tuple[list[EntryResults], str]:
+    """Return what is shown of an entry's copies, see `united`; and own ones beside it that get less far."""
+    whole, problem = united(copies)
+    shorter = [copy for copy in copies if copy.source == "runs" and _weight(copy)[0] < _weight(whole)[0]]
+    return [*shorter, whole.marked(BESIDE) if shorter else whole], problem
 
 
 def _weight(entry: EntryResults) -> tuple[int, int, int]:
@@ -388,31 +394,32 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         if refused:
             raise StoreError("; ".join(refused))
         return None
-    made_by = [codes.read(run.record, store.seed(run.seed).path) for run in runs]
-    entry = EntryResults.of_record(
-        record,
+    results = {run.seed: _of_run(store, run) for run in runs}
+    return EntryResults.of(record, store.path, results, mark=store.mark, refused=tuple(refused))
+
+
+def _of_run(store: EntryStore, run: SeedRun) -> SeedResult:
+    probe = probes.of_record(run.record) or {"result": ""}
+    if probe["result"] == probes.DIFFERS:
+        raise StoreError(
+            f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.get('seed')} "
+            f"differs in {probe.get('difference')}; `qrlsuite check` looks for the cause"
+        )
+    return SeedResult(
         store.path,
-        {run.seed: run.curve for run in runs},
-        {
-            run.seed: {
-                "epochs": len(run.scores),
-                "finished": run.finished,
-                "hours": run.seconds / 3600,
-                "executions": run.executions,
-                "diverged": run.diverged,
-            }
-            for run in runs
-        },
-        parameters_of(run.record for run in runs),
-        [made for run in runs for made in run.record.get("provenance", [])],
-        _require_independent(store, runs),
-        clocked=any(run.clocked for run in runs),
-        codes=codes.distinct(made_by),
-        environments=codes.environments(made_by),
-        refused=tuple(refused),
-        measured={run.seed: run.measured for run in runs if run.measured},
+        run.curve,
+        len(run.scores),
+        run.finished,
+        run.seconds / 3600,
+        run.executions,
+        run.clocked,
+        run.diverged,
+        run.measured,
+        run.record.get("parameters", {}),
+        run.record.get("provenance", []),
+        codes.read(run.record, store.seed(run.seed).path),
+        probe["result"],
     )
-    return entry.marked(store.mark)
 
 
 def _readable(
@@ -441,15 +448,3 @@ def _readable(
         for seed in seeds:
             del runs[seed]
     return list(runs.values()), refused
-
-
-def _require_independent(store: EntryStore, runs: Sequence[SeedRun]) -> set[str]:
-    """Return the results of probes of an entry's runs (`qrlsuite.results.probes`); dependent seeds are an error."""
-    made = [probe for run in runs if (probe := probes.of_record(run.record)) is not None]
-    for probe in made:
-        if probe["result"] == probes.DIFFERS:
-            raise StoreError(
-                f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.get('seed')} "
-                f"differs in {probe.get('difference')}; `qrlsuite check` looks for the cause"
-            )
-    return {probe["result"] for probe in made}

@@ -6,6 +6,7 @@ import contextlib
 import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from rich.text import Text
 from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance
@@ -26,215 +28,368 @@ from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.store import MEASURED
 from qrlsuite.results.text import counted
 
+BESIDE = "-published"
+"""The mark of a published entry that stands beside own runs of it."""
 
-@dataclass(frozen=True, repr=False)
-class EntryResults(Shown):
-    """An entry with the learning curves of its complete runs. It shows itself as a short table.
+
+@dataclass(frozen=True, eq=False)
+class SeedResult:
+    """What is known of one seed.
 
     Attributes
     ----------
-    parameters:
-        Trainable numbers of one agent: classical, quantum.
-    fixed:
-        Numbers of one agent that stay as drawn.
-    networks:
-        Number of trained networks, over which `parameters` are summed. None in records of older versions, which counted
-        the first network alone, see `first_network_alone`.
-    curves:
-        (N, T) float64: mean validation score per run and epoch. Half of the finished runs or more have T epochs.
-    seeds:
-        The N seeds.
-    left_out:
-        Seeds whose runs have fewer than T epochs yet.
-    runs:
-        Every run's whole curve by seed, shorter or longer than T; empty if all have T epochs.
-    hours:
-        Core-hours spent on all runs, with the left-out ones.
+    folder:
+        Where it was read: the entry's folder.
+    curve:
+        (t,) float64: mean validation score of its first epochs.
+    epochs:
+        Its finished epochs, t or more.
+    finished:
+        Whether it reached the epochs that were asked for.
+    hours, executions:
+        The core-hours and circuit executions of all its epochs.
     clocked:
-        Whether some of these hours are by the clock and not processor time; None if not recorded.
-    codes:
-        Digests of the code identities of its seeds; empty if all code is the suite's first version, or unknown.
-    environments:
-        Digests of every code of the environment among its seeds; empty if the environment is the suite's.
-    plugins:
-        Contents of plugins by path that trained its seeds, by file name.
-    identity:
-        Content of the entry's hash: task, algorithm, model and their resolved options.
-    options:
-        The resolved options under "algorithm", "model" and "environment".
-    preset:
-        The preset that supplied defaults.
-    versions:
-        Every version that occurs among the seeds, by distribution; Python's under "python".
-    commits, processors, devices:
-        Every code revision, processor and kind of device that occurs among the seeds.
-    executions:
-        Circuit executions of all these runs.
-    tuning:
-        How the settings were found, if their preset says so, see `qrlsuite.experiment.preset.EntryTuning`.
-    plan:
-        Hash of the study with looks that trained it; None if the number of seeds was fixed in advance.
-    source:
-        Whether the curves were read from a results folder or from a published entry.
-    external:
-        Whether another program made the curves: nobody here trained them, or can check them.
-    agents:
-        The seeds whose trained agents are published with it; empty for an entry from a results folder.
-    color:
-        Number of its color and pattern in pictures, which stays if others are left out; None takes the next number.
-    unprobed:
-        Whether it has code of others and no probe has shown that its seeds are independent.
-    chosen_seeds:
-        Why no board ranks it, if it is published and its seeds may have been chosen; empty otherwise.
-    first_thresholds:
-        The thresholds in force when its first seed was trained; None if not recorded.
-    records:
-        Number of its color and pattern in pictures, kept where others are left out; None takes the next number.
-        first epoch after which its agent's numbers were not finite.
-    refused:
-        One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
+        Whether any of these hours are by the clock and not processor time; None where the record does not say.
+    diverged:
+        The first epoch after which its agent's numbers were not finite.
     measured:
-        Metrics of the environment by seed and name, see `qrlsuite.results.store.SeedRun.measured`.
+        By name, what the environment measured of each epoch's validation, see
+        `qrlsuite.results.store.SeedRun.measured`.
+    parameters:
+        Numbers of its agent: `classical` and `quantum` ones that are trained, summed over `networks`; `fixed` ones.
+    made_with:
+        What made it, see `qrlsuite.results.provenance.collect`.
+    code:
+        The identity of the code that began it; None where that was not recorded.
+    probed:
+        The result of a probe of independent seeds, empty where none was made with it.
+    published:
+        Whether it was read from a published entry, not from a results folder.
+    agent:
+        Whether its trained agent is published with it.
     """
 
-    name: str
-    label: str
-    task: str
-    task_hash: str
-    task_file: TaskFile
-    algorithm: str
-    model: str
-    parameters: tuple[int, int]
-    curves: NDArray[np.float64]
-    seeds: tuple[int, ...]
-    left_out: tuple[int, ...]
-    hours: float
     folder: Path
-    identity: Mapping[str, Any] = field(default_factory=dict)
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    preset: str | None = None
-    versions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    commits: tuple[str, ...] = ()
-    processors: tuple[str, ...] = ()
-    devices: tuple[str, ...] = ()
+    curve: NDArray[np.float64]
+    epochs: int
+    finished: bool = True
+    hours: float = 0.0
     executions: int = 0
-    tuning: Mapping[str, Any] | None = None
-    plan: str | None = None
-    source: Literal["runs", "published"] = "runs"
-    external: bool = False
-    runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-    agents: tuple[int, ...] = ()
-    color: int | None = None
-    records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
-    networks: int | None = None
-    fixed: int = 0
     clocked: bool | None = None
-    codes: tuple[str, ...] = ()
-    environments: frozenset[str] = frozenset()
-    plugins: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    refused: tuple[str, ...] = ()
-    unprobed: bool = False
-    chosen_seeds: str = ""
-    first_thresholds: tuple[float, ...] | None = None
-    measured: Mapping[int, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
+    diverged: int | None = None
+    measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    parameters: Mapping[str, int] = field(default_factory=dict)
+    made_with: Sequence[Mapping[str, Any]] = ()
+    code: CodeIdentity | None = None
+    probed: str = ""
+    published: bool = False
+    agent: bool = False
 
-    @classmethod
-    def of_record(
-        cls,
-        record: EntryRecord,
-        folder: Path,
-        curves: Mapping[int, NDArray[np.float64]],
-        records: Mapping[int, Mapping[str, Any]],
-        parameters: Mapping[str, int],
-        made_with: Sequence[Mapping[str, Any]],
-        probed: Collection[str],
-        **facts: Any,
-    ) -> EntryResults:
-        """Return the results of an entry, from runs or published.
-
-        Parameters
-        ----------
-        curves:
-            Each seed's curve (T,); lengths may differ.
-        parameters:
-            The result of `qrlsuite.results.store.parameters_of`.
-        made_with:
-            Provenance of the seeds, see `qrlsuite.results.provenance.collect`.
-        probed:
-            The results of probes of its seeds.
-        records, facts:
-            Further attributes, unchanged.
-        """
-        identity, now = record.identity, current(record)
-        length = _common_length(records.values())
-        kept = [seed for seed, curve in curves.items() if len(curve) >= length]
-        return cls(
-            name=record.name,
-            label=record.label,
-            task=record.task_name,
-            task_hash=record.task_hash,
-            task_file=now,
-            algorithm=identity.algorithm,
-            model=identity.model,
-            parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
-            networks=parameters.get("networks"),
-            fixed=int(parameters.get("fixed", 0)),
-            curves=np.stack([curves[seed][:length] for seed in kept]),
-            seeds=tuple(kept),
-            left_out=tuple(seed for seed in curves if seed not in kept),
-            runs=curves if any(len(curve) != length for curve in curves.values()) else {},
-            hours=float(np.sum([spent["hours"] for spent in records.values()])),
-            executions=sum(spent["executions"] for spent in records.values()),
-            records=records,
-            folder=folder,
-            identity=identity.content,
-            options={
-                "algorithm": identity.algorithm_options,
-                "model": identity.model_options,
-                "environment": now.environment.options,
-            },
-            preset=record.preset,
-            tuning=record.tuned,
-            plan=record.plan,
-            versions=provenance.versions(made_with),
-            commits=provenance.texts(made_with, "commit"),
-            processors=provenance.texts(made_with, "processor"),
-            devices=provenance.devices(made_with),
-            unprobed=any(map(probes.third_party, made_with)) and probes.EQUAL not in probed,
-            first_thresholds=record.task_file.ranking.grid.thresholds,
-            external=record.imported is not None,
-            plugins=codes.contents(record, facts.get("codes", ())),
-            **facts,
+    def __add__(self, other: SeedResult) -> SeedResult:
+        """Return the longer one; of equally long ones the published one."""
+        return max(
+            self, other, key=lambda seed: (len(seed.curve), seed.epochs, seed.published, str(seed.folder))
         )
 
-    def marked(self, mark: str) -> EntryResults:
-        """Return the entry with the mark of its code behind its name and its label."""
-        if not mark or "@" in self.name:
-            return self
-        return replace(self, name=f"{self.name}{mark}", label=f"{self.label} {mark}")
+    def agrees(self, other: SeedResult) -> bool:
+        """Return whether the curves are equal in the epochs that both have."""
+        shared = min(len(self.curve), len(other.curve))
+        return np.array_equal(self.curve[:shared], other.curve[:shared])
 
-    def reaching(self, epochs: int) -> EntryResults | None:
-        """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
-        if not self.runs:
-            return self if self.curves.shape[1] >= epochs else None
-        kept = {seed: curve[:epochs] for seed, curve in self.runs.items() if len(curve) >= epochs}
-        if not kept:
-            return None
-        out = tuple(sorted(set(self.runs) - set(kept)))
-        return replace(self, curves=np.stack(list(kept.values())), seeds=tuple(kept), left_out=out, runs={})
+    def cut(self, epochs: int) -> SeedResult:
+        """Return the seed with its first epochs alone."""
+        return self if len(self.curve) <= epochs else replace(self, curve=self.curve[:epochs])
+
+
+class DifferentCurvesError(StoreError):
+    """Two folders have different curves of the same seed."""
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class EntryResults(Shown):
+    """The seeds of an entry: from a results folder, published, or of another program. It shows itself as a short table.
+
+    Results of the same entry add: `mine + published` has the seeds of both.
+
+    Attributes
+    ----------
+    record:
+        What was run.
+    task_file:
+        The task as it is judged: as it is registered now, where its definition is the same.
+    records:
+        By seed, left-out ones too.
+    epochs:
+        T of `curves`.
+    folder:
+        Where it was read; of a sum, that of the results with more seeds.
+    mark:
+        What follows its name where seeds of one name are shown apart.
+    refused:
+        One line for each seed that does not count, because a file of it is damaged or it is not what it says.
+    chosen_seeds:
+        Why no board ranks it, of a published entry whose seeds may have been chosen; empty otherwise.
+    color:
+        Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
+    """
+
+    record: EntryRecord
+    task_file: TaskFile
+    records: Mapping[int, SeedResult]
+    epochs: int
+    folder: Path
+    mark: str = ""
+    refused: tuple[str, ...] = ()
+    chosen_seeds: str = ""
+    color: int | None = None
+
+    @classmethod
+    def of(
+        cls, record: EntryRecord, folder: Path, seeds: Mapping[int, SeedResult], **facts: Any
+    ) -> EntryResults:
+        """Return the results of an entry, cut to the epochs that half of the finished seeds or more have."""
+        return cls(record, current(record), seeds, _common_length(seeds.values()), folder, **facts)
+
+    def __add__(self, other: EntryResults) -> EntryResults:
+        """Return the union of the seeds, the longer curve of each; a `DifferentCurvesError` where they differ."""
+        same = (self.task_hash, self.record.hash) == (other.task_hash, other.record.hash)
+        if not (same and self.has_code_of(other)):
+            raise OptionError(
+                f"'{self.label}' and '{other.label}' are not the same entry: their seeds do not add"
+            )
+        for seed in sorted(self.records.keys() & other.records.keys()):
+            here, there = self.records[seed], other.records[seed]
+            if not here.agrees(there):
+                first, second = sorted((str(here.folder), str(there.folder)))
+                raise DifferentCurvesError(f"seed {seed} has one curve in {first} and another in {second}")
+        seeds = {**self.records, **other.records}
+        seeds |= {
+            seed: self.records[seed] + other.records[seed] for seed in self.records.keys() & other.records
+        }
+        return replace(
+            max(self, other, key=lambda results: (len(results.records), str(results.folder))),
+            records=dict(sorted(seeds.items())),
+            epochs=_common_length(seeds.values()),
+            refused=tuple(sorted({*self.refused, *other.refused})),
+            chosen_seeds=max(self.chosen_seeds, other.chosen_seeds),
+        )
+
+    def has_code_of(self, other: EntryResults) -> bool:
+        """Return whether the seeds of both were trained by the same code, or by code that was declared to be."""
+        return self.codes == other.codes or bool(set(self.codes) & set(other.codes))
 
     @property
-    def metrics(self) -> dict[str, NDArray[np.float64]]:
-        """Metrics of the environment along the curves by name, (N, T) each; NaN where it measured none."""
-        held = [self.measured.get(seed, {}) for seed in self.seeds]
-        length, nothing = self.curves.shape[1], np.full(self.curves.shape[1], np.nan)
-        names = sorted({name for own in held for name in own})
-        return {name: np.stack([own.get(name, nothing)[:length] for own in held]) for name in names}
+    def name(self) -> str:
+        """Algorithm, model and hash, with the mark."""
+        return f"{self.record.name}{self.mark}"
+
+    @property
+    def label(self) -> str:
+        """Algorithm, model and the options that are not defaults, with the mark."""
+        mark = "(published)" if self.mark == BESIDE else self.mark
+        return f"{self.record.label} {mark}".rstrip()
+
+    @property
+    def task(self) -> str:
+        """The task's name."""
+        return self.record.task_name
+
+    @property
+    def task_hash(self) -> str:
+        """Hash of the task's definition."""
+        return self.record.task_hash
+
+    @property
+    def algorithm(self) -> str:
+        """The algorithm's name."""
+        return self.record.identity.algorithm
+
+    @property
+    def model(self) -> str:
+        """The model's name."""
+        return self.record.identity.model
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """What the entry's hash covers: task, algorithm, model and their resolved options."""
+        return self.record.identity.content
+
+    @property
+    def options(self) -> dict[str, Mapping[str, Any]]:
+        """The resolved options under "algorithm", "model" and "environment"."""
+        identity = self.record.identity
+        return {
+            "algorithm": identity.algorithm_options,
+            "model": identity.model_options,
+            "environment": self.task_file.environment.options,
+        }
+
+    @property
+    def preset(self) -> str | None:
+        """The preset that supplied defaults."""
+        return self.record.preset
+
+    @property
+    def tuning(self) -> Mapping[str, Any] | None:
+        """How the settings were found, where their preset says so, see `qrlsuite.experiment.preset.EntryTuning`."""
+        return self.record.tuned
+
+    @property
+    def plan(self) -> str | None:
+        """Hash of the study with looks that trained it; None for a number of seeds that was fixed in advance."""
+        return self.record.plan
+
+    @property
+    def external(self) -> bool:
+        """Whether another program made the curves: nobody here trained them, or can check them."""
+        return bool(self.record.imported)
+
+    @property
+    def first_thresholds(self) -> tuple[float, ...] | None:
+        """The thresholds in force when its first seed was trained; None where the record does not say."""
+        return self.record.task_file.ranking.grid.thresholds
+
+    @cached_property
+    def seeds(self) -> tuple[int, ...]:
+        """The N seeds with T epochs or more."""
+        return tuple(seed for seed, result in self.records.items() if len(result.curve) >= self.epochs)
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Seeds whose runs have fewer than T epochs yet."""
+        return tuple(seed for seed in self.records if seed not in self.seeds)
+
+    @cached_property
+    def curves(self) -> NDArray[np.float64]:
+        """(N, T) float64: mean validation score per seed and epoch."""
+        return np.stack([self.records[seed].curve[: self.epochs] for seed in self.seeds])
+
+    @cached_property
+    def counts(self) -> Mapping[str, int]:
+        """The numbers of an agent; those of older versions, without `networks`, only where no seed has newer ones."""
+        counts = [result.parameters for result in self.records.values()]
+        return next((each for each in counts if "networks" in each), counts[0])
+
+    @property
+    def parameters(self) -> tuple[int, int]:
+        """Trainable numbers of one agent: classical, and of circuits."""
+        return int(self.counts.get("classical", 0)), int(self.counts.get("quantum", 0))
+
+    @property
+    def networks(self) -> int | None:
+        """The networks that `parameters` are summed over, all that are trained.
+
+        None in records of older versions, which counted the first alone, see `first_network_alone`.
+        """
+        return self.counts.get("networks")
+
+    @property
+    def fixed(self) -> int:
+        """Numbers of one agent that stay as drawn."""
+        return int(self.counts.get("fixed", 0))
+
+    @property
+    def source(self) -> Literal["runs", "published", "runs and published"]:
+        """Whether the curves were read from a results folder, from a published entry, or from both."""
+        origins = {result.published for result in self.records.values()}
+        return "runs and published" if len(origins) > 1 else "published" if True in origins else "runs"
+
+    @property
+    def folders(self) -> list[Path]:
+        """Where its seeds were read."""
+        return list(dict.fromkeys(result.folder for result in self.records.values()))
+
+    @property
+    def agents(self) -> tuple[int, ...]:
+        """The seeds whose trained agents are published with it; none of an entry from a results folder."""
+        return tuple(seed for seed, result in self.records.items() if result.agent)
+
+    @property
+    def hours(self) -> float:
+        """Core-hours spent on the seeds, those that were left out too."""
+        return float(np.sum([result.hours for result in self.records.values()]))
+
+    @property
+    def executions(self) -> int:
+        """Circuit executions of these seeds in all."""
+        return sum(result.executions for result in self.records.values())
+
+    @property
+    def clocked(self) -> bool | None:
+        """Whether any of the hours are by the clock and not processor time; None where a record does not say."""
+        clocked = {result.clocked for result in self.records.values()}
+        return None if None in clocked else True in clocked
+
+    @cached_property
+    def _made_with(self) -> list[Mapping[str, Any]]:
+        """What made the seeds, each once."""
+        made = (made for result in self.records.values() for made in result.made_with)
+        return list({id(each): each for each in made}.values())
+
+    @cached_property
+    def versions(self) -> Mapping[str, tuple[str, ...]]:
+        """Every version that occurs among the seeds, by distribution; Python's under "python"."""
+        return provenance.versions(self._made_with)
+
+    @property
+    def commits(self) -> tuple[str, ...]:
+        """Every code revision that occurs among the seeds."""
+        return provenance.texts(self._made_with, "commit")
+
+    @property
+    def processors(self) -> tuple[str, ...]:
+        """Every processor that occurs among the seeds."""
+        return provenance.texts(self._made_with, "processor")
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Every kind of device that occurs among the seeds."""
+        return provenance.devices(self._made_with)
+
+    @property
+    def unprobed(self) -> bool:
+        """Whether code of others has part in it and no probe has shown that its seeds are independent."""
+        probed = {result.probed for result in self.records.values()}
+        return probes.EQUAL not in probed and any(map(probes.third_party, self._made_with))
+
+    @cached_property
+    def codes(self) -> tuple[str, ...]:
+        """Digests of the code of its seeds; none where all is the suite's with its first bits, or unknown."""
+        return codes.distinct(self._codes)
+
+    @cached_property
+    def environments(self) -> frozenset[str]:
+        """Digests of the environment's code, of every one that occurs among its seeds; none where it is the suite's."""
+        return codes.environments(self._codes)
+
+    @cached_property
+    def _codes(self) -> list[CodeIdentity | None]:
+        made_by = (result.code for result in self.records.values())
+        return list({id(code): code for code in made_by}.values())
+
+    @property
+    def plugins(self) -> Mapping[str, frozenset[str]]:
+        """Of the plugins by path among that code, by file name: which contents trained its seeds."""
+        return codes.contents(self.record, self.codes)
+
+    def marked(self, mark: str) -> EntryResults:
+        """Return the entry with a mark behind its name and its label, unless it has one."""
+        return self if self.mark else replace(self, mark=mark)
+
+    def reaching(self, epochs: int) -> EntryResults | None:
+        """Return the entry with the seeds that have reached some epochs, itself where all have; None for none."""
+        lengths = {len(result.curve) for result in self.records.values()}
+        if lengths == {self.epochs}:
+            return self if self.epochs >= epochs else None
+        return self._first(epochs) if max(lengths) >= epochs else None
 
     def cut(self, epochs: int) -> EntryResults | None:
-        """Return the first epochs of every run that has reached them; None if no run has."""
-        reached = self.reaching(epochs)
-        return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
+        """Return the first epochs of every seed that has reached a number of them; None for none."""
+        return self._first(epochs) if self.longest >= epochs else None
+
+    def _first(self, epochs: int) -> EntryResults:
+        seeds = {seed: result.cut(epochs) for seed, result in self.records.items()}
+        return replace(self, epochs=epochs, records=seeds)
 
     def with_seeds(self, seeds: int | str | Iterable[int]) -> EntryResults:
         """Return the entry with these seeds only, to see the results of fewer seeds.
@@ -248,18 +403,15 @@ class EntryResults(Shown):
         missing = sorted(set(wanted) - set(self.seeds))
         if missing:
             raise OptionError(f"'{self.label}' has no complete run of seed {missing[0]}")
-        places = [self.seeds.index(seed) for seed in wanted]
-        records = {seed: self.records[seed] for seed in wanted if seed in self.records}
-        return replace(
-            self,
-            curves=self.curves[places],
-            seeds=tuple(wanted),
-            left_out=(),
-            runs={},
-            records=records,
-            hours=sum(float(record["hours"]) for record in records.values()),
-            executions=sum(int(record["executions"]) for record in records.values()),
-        )
+        return replace(self, records={seed: self.records[seed].cut(self.epochs) for seed in wanted})
+
+    @property
+    def metrics(self) -> dict[str, NDArray[np.float64]]:
+        """By name, what the environment measured along the curves, (N, T) each; NaN where it did not."""
+        measured = [self.records[seed].measured for seed in self.seeds]
+        nothing = np.full(self.epochs, np.nan)
+        names = sorted({name for own in measured for name in own})
+        return {name: np.stack([own.get(name, nothing)[: self.epochs] for own in measured]) for name in names}
 
     @property
     def changed_thresholds(self) -> bool:
@@ -270,8 +422,8 @@ class EntryResults(Shown):
     @property
     def diverged(self) -> tuple[int, ...]:
         """The seeds with agents whose numbers were not finite within the curves' epochs."""
-        first = {seed: self.records.get(seed, {}).get("diverged") for seed in self.seeds}
-        return tuple(seed for seed, epoch in first.items() if epoch and epoch <= self.curves.shape[1])
+        first = {seed: self.records[seed].diverged for seed in self.seeds}
+        return tuple(seed for seed, epoch in first.items() if epoch and epoch <= self.epochs)
 
     def to_table(self) -> pyarrow.Table:
         """Return the curves as an Arrow table of N x T rows, seed by seed: `to_pandas()`, or `polars.from_arrow`.
@@ -309,7 +461,7 @@ class EntryResults(Shown):
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
             f"last {self.task_file.score.called}": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
             "core-hours": f"{self.hours:.2f}" if self.hours or not self.external else "-",
-            "read from": str(self.folder),
+            "read from": ", ".join(map(str, self.folders)),
         }
 
     def __rich__(self) -> Table:
@@ -354,7 +506,7 @@ class EntryResults(Shown):
     @property
     def longest(self) -> int:
         """The epochs of the longest run."""
-        return max((len(curve) for curve in self.runs.values()), default=int(self.curves.shape[1]))
+        return max(len(result.curve) for result in self.records.values())
 
     @property
     def mixed_versions(self) -> tuple[str, ...]:
@@ -448,10 +600,10 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _common_length(records: Collection[Mapping[str, Any]]) -> int:
-    """Return the epochs that half of the finished runs or more have; before any finished, the fewest of any run."""
-    lengths = sorted((int(run["epochs"]) for run in records if run["finished"]), reverse=True)
-    return lengths[(len(lengths) - 1) // 2] if lengths else min(int(run["epochs"]) for run in records)
+def _common_length(seeds: Collection[SeedResult]) -> int:
+    """Return the epochs that half of the finished seeds or more have; before any finished, the fewest of any seed."""
+    lengths = sorted((len(result.curve) for result in seeds if result.finished), reverse=True)
+    return lengths[(len(lengths) - 1) // 2] if lengths else min(len(result.curve) for result in seeds)
 
 
 def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:

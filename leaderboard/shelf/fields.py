@@ -60,7 +60,7 @@ NAMES = (
     Field("name", _TEXT, "the entry's name, which ends with digits of its hash"),
     Field("algorithm", _TEXT, "`external` for curves that another program made"),
     Field("model", _TEXT, "the model"),
-    Field("source", _TEXT, "where it was read: `runs` or `published`"),
+    Field("source", _TEXT, "where it was read: `runs`, `published`, or `runs and published`"),
     Field("external", _TRUTH, "whether another program made the curves"),
 )
 SCORES = (
@@ -268,15 +268,15 @@ def _cost(entry: EntryResults, value: Any) -> Any:
 def _of_seeds(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
     """Return the complete seeds, and the left-out seeds without scores."""
     seeds = [*entry.seeds, *entry.left_out]
-    records = [entry.records.get(seed, {}) for seed in seeds]
+    records = [entry.records[seed] for seed in seeds]
     lacking = [None] * len(entry.left_out)
     return {
         "seed": seeds,
-        "epochs": [record.get("epochs") for record in records],
-        "finished": [record.get("finished") for record in records],
-        "diverged": [record.get("diverged") for record in records],
-        "core_hours": [_cost(entry, record.get("hours")) for record in records],
-        "executions": [_cost(entry, record.get("executions")) for record in records],
+        "epochs": [record.epochs for record in records],
+        "finished": [record.finished for record in records],
+        "diverged": [record.diverged for record in records],
+        "core_hours": [_cost(entry, record.hours) for record in records],
+        "executions": [_cost(entry, record.executions) for record in records],
         **{name: [*values.tolist(), *lacking] for name, values in _scores(entry).items()},
     }
 

@@ -29,11 +29,11 @@ from qrlsuite.engine.terminal import command
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
+from qrlsuite.leaderboard.shelf.curves import EntryResults, SeedResult, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.notation import parse_entry
 from qrlsuite.registry import load as registered
-from qrlsuite.results import codes, parquet, provenance
+from qrlsuite.results import parquet, provenance
 from qrlsuite.results.records import AgentsRecord, EntryRecord, PublishedRecord
 from qrlsuite.results.store import (
     MEASURED,
@@ -143,34 +143,28 @@ class PublishedEntry:
         return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
 
     def entry_results(self) -> EntryResults:
-        """Return the entry as a leaderboard ranks it."""
-        made_by, diverged = [self.record.code_identity], self.published.diverged
-        return EntryResults.of_record(
-            self.record,
-            self.folder,
-            dict(zip(self.seeds, self.curves)),
-            {
-                seed: {
-                    "epochs": int(self.curves.shape[1]),
-                    "finished": True,
-                    "hours": float(hours),
-                    "executions": int(executions),
-                    "diverged": diverged.get(str(seed)),
-                }
-                for seed, hours, executions in zip(self.seeds, self.hours, self.executions)
-            },
-            self.published.parameters,
-            [made for last in self.provenance for made in provenance.records(last)],
-            {self.published.probe.result} if self.published.probe else (),
-            codes=codes.distinct(made_by),
-            environments=codes.environments(made_by),
-            source="published",
-            chosen_seeds=self.chosen_seeds,
-            agents=self.agents,
-            measured={seed: self.metrics(row) for row, seed in enumerate(self.seeds)}
-            if self.measured
-            else {},
-        )
+        """Return what a leaderboard ranks."""
+        said, code = self.published, self.record.code_identity
+        probed = "" if said.probe is None else said.probe.result
+        seeds = {
+            seed: SeedResult(
+                self.folder,
+                self.curves[row],
+                int(self.curves.shape[1]),
+                hours=float(self.hours[row]),
+                executions=int(self.executions[row]),
+                diverged=said.diverged.get(str(seed)),
+                measured=self.metrics(row),
+                parameters=said.parameters,
+                made_with=provenance.records(said.provenance[self.origins[row]]),
+                code=code,
+                probed=probed,
+                published=True,
+                agent=seed in self.agents,
+            )
+            for row, seed in enumerate(self.seeds)
+        }
+        return EntryResults.of(self.record, self.folder, seeds, chosen_seeds=self.chosen_seeds)
 
     def metrics(self, row: int) -> dict[str, NDArray[np.float64]]:
         """Return the metrics of one seed's environment, (T,) by name."""

@@ -46,8 +46,8 @@ def load(
     runs:
         The results folder.
     published:
-        Look among the published entries that come with the suite, too. Of an entry that is in both, the copy that
-        gets further, then that with more seeds, is read.
+        Look among the published entries that come with the suite, too. Of an entry that is in both, the seeds of both
+        are read; where they do not add, or one copy gets further, the better copy.
 
     Returns
     -------

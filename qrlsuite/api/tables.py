@@ -48,7 +48,8 @@ def table(
     Returns
     -------
     pyarrow.Table
-        In all: `task`, `entry` (the label), `name`, `algorithm`, `model`, `source` (`runs` or `published`), `external`.
+        In all: `task`, `entry` (the label), `name`, `algorithm`, `model`, `source` (`runs`, `published`, or
+        `runs and published`), `external`.
 
         Of entries: `preset`, `tuned`, `seeds`, `epochs`, `steps` (environment steps of each seed), `parameters`
         (trained numbers of an agent), `parameters_quantum`, `parameters_fixed`; means over seeds:

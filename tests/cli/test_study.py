@@ -7,7 +7,6 @@ import os
 import re
 import signal
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -498,8 +497,8 @@ def test_which_pairs_count() -> None:
     ranking = boards.of(entries).sections[0].times
     assert studies.decided_pairs(entries) == (ranking.n_decided, 6)
     assert ranking.n_decided > 0
-    planned = replace(entries[0], plan="abc")
-    few = replace(entries[1], curves=entries[1].curves[:19], seeds=entries[1].seeds[:19], runs={})
+    planned = boards.changed(entries[0], plan="abc")
+    few = entries[1].with_seeds(19)
     assert studies.decided_pairs([planned, few, *entries[2:]])[1] == 1, "of the last two"
 
 

@@ -29,6 +29,7 @@ from qrlsuite.results.store import EntryStore, read_json, write_json
 from qrlsuite.training.remote_task import pack, unpack, work_on
 from tests.commands import qrlsuite, start_worker
 from tests.conftest import TINY, Train, install, installed
+from tests.leaderboard import boards
 
 PLUGIN = """
 from qrlsuite import hookimpl, specs
@@ -483,11 +484,12 @@ def test_a_published_entry_of_other_code_is_another_entry(kept: Train, tmp_path:
     entry = collect.read(EntryStore(folder))
     assert entry is not None
     assert entry.codes == (identity.of(resolve("beam6g", "mlp width=16")).digest,)
-    entry = replace(entry, codes=())  # as what is published from before codes were recorded
-    copies = [entry, replace(entry, codes=("1a2b3c4d5e6f7a8b",)), replace(entry, source="published")]
+    entry = boards.changed(entry, code=None)  # as an entry published before codes were recorded
+    other = identity.CodeIdentity(({"role": "model", "name": "other", "distribution": "x"},))
+    copies = [entry, boards.changed(entry, code=other), boards.changed(entry, published=True)]
     assert [[copy.label for copy in same] for same in collect.told_apart(copies)] == [
         ["ddqn mlp width=16 @00000000"] * 2,
-        ["ddqn mlp width=16 @1a2b3c4d"],
+        [f"ddqn mlp width=16 @{other.digest[:8]}"],
     ]
 
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment import task as tasks
+from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.leaderboard.boards import board
-from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults, SeedResult
+from qrlsuite.results.records import EntryIdentity, EntryRecord
 from tests.commands import say
 
+Floats = NDArray[np.float64]
 HOSTILE = (
     "<script>alert(1)</script>",
     '"><img src=x onerror="document.title=1">',
@@ -32,22 +38,52 @@ def entry(
     pace = speed * generator.lognormal(0, 0.25, (seeds, 1)) / 20
     rising = 0.93 - 0.6 * np.exp(-pace * np.arange(1, epochs + 1))
     curves = np.clip(rising + 0.02 * generator.standard_normal((seeds, epochs)), 0, 1)
-    return EntryResults(
+    identity = {"algorithm_options": {"gamma": 0.95, "lr": 5e-4}, "model_options": {"name": label}}
+    record = EntryRecord.model_construct(
         name=label,
+        hash=label,
         label=label,
-        task=task,
+        task_name=task,
         task_hash="0123456789abcdef",
         task_file=file,
-        algorithm="ddqn",
-        model=label.split()[0],
-        parameters=(387, quantum),
-        curves=curves,
-        seeds=tuple(range(seeds)),
-        left_out=(),
-        hours=0.25,
-        folder=Path(label),
-        identity={"algorithm_options": {"gamma": 0.95, "lr": 5e-4}, "model_options": {"name": label}},
+        identity=identity_of({"algorithm": "ddqn", "model": label.split()[0], **identity}),
     )
+    parameters = {"classical": 387, "quantum": quantum}
+    results = {
+        seed: SeedResult(Path(label), curve, epochs, hours=0.25 / seeds, parameters=parameters)
+        for seed, curve in enumerate(curves)
+    }
+    return EntryResults.of(record, Path(label), results)
+
+
+def identity_of(content: Mapping[str, Any]) -> EntryIdentity:
+    return EntryIdentity.model_validate({"task": {}, "algorithm_options": {}, "model_options": {}, **content})
+
+
+def changed(entry: EntryResults, *, curves: Floats | None = None, **facts: Any) -> EntryResults:
+    """The entry with other facts, whether its record, its seeds or itself have them; with other curves (N, T)."""
+    tables: dict[type, dict[str, Any]] = {SeedResult: {}, EntryRecord: {}, EntryResults: {}}
+    for name, value in facts.items():
+        tables[next(table for table in tables if name in _fields(table))][name] = value
+    if "tuning" in facts:
+        tables[EntryRecord]["tuning"] = EntryTuning.model_validate(facts["tuning"])
+    if "identity" in facts:
+        own = {"algorithm": entry.algorithm, "model": entry.model}
+        tables[EntryRecord]["identity"] = identity_of({**own, **facts["identity"]})
+    results = {seed: replace(result, **tables[SeedResult]) for seed, result in entry.records.items()}
+    if curves is not None:
+        usual = next(iter(results.values()))
+        results = {
+            seed: replace(results.get(seed, usual), curve=curve, epochs=len(curve))
+            for seed, curve in enumerate(curves)
+        }
+        tables[EntryResults]["epochs"] = curves.shape[1]
+    record = entry.record.model_copy(update=tables[EntryRecord])
+    return replace(entry, **{"record": record, "records": results, **tables[EntryResults]})
+
+
+def _fields(table: type) -> Collection[str]:
+    return EntryRecord.model_fields if table is EntryRecord else [field.name for field in fields(table)]
 
 
 def of(entries: Sequence[EntryResults], refused: Sequence[str] = ()) -> board.Leaderboard:

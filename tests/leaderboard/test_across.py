@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ def runs_of(label: str, task: str, epochs_below: list[int], **identity: object) 
     curves = np.ones(entry.curves.shape)
     for run, epoch in enumerate(epochs_below):
         curves[run, :epoch] = 0
-    return replace(entry, curves=curves, identity={**entry.identity, **identity})
+    return boards.changed(entry, curves=curves, identity={**entry.identity, **identity})
 
 
 def both(label: str, share: float, seeds: int = 20) -> list[EntryResults]:
@@ -80,7 +79,7 @@ def test_a_configuration_is_algorithm_model_and_options() -> None:
 
 
 def test_what_is_left_out_says_why() -> None:
-    short = replace(runs_of("short", "cartpole", [1] * 20), curves=np.ones((20, 50)))
+    short = boards.changed(runs_of("short", "cartpole", [1] * 20), curves=np.ones((20, 50)))
     entries = [*both("quick", 0.2), *both("few", 0.2, 19), runs_of("short", "beam6g", [1] * 20), short]
     board = across.section(entries, TASKS)
     assert "cartpole: short: ends at 50000 of 100000 steps" in board.shares.refused

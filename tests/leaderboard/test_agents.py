@@ -6,7 +6,6 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
 from tests.commands import say
 from tests.conftest import TINY, Train, trainer
+from tests.leaderboard import boards
 from tests.leaderboard.boards import refused
 
 SEEDS = (0, 1, 2)
@@ -144,7 +144,7 @@ def test_agents_of_other_curves_are_not_added(folder: Path, tmp_path: Path) -> N
     bare = export(whole, tmp_path / "bare", agents=False)
     curves = whole.curves.copy()
     curves[1, 1] -= 1e-6
-    export(replace(whole, curves=curves), tmp_path / "bare")
+    export(boards.changed(whole, curves=curves), tmp_path / "bare")
     written = json.loads((bare / "entry.json").read_text())["published"]
     assert "provenance" not in written["agents"], "a new entry, not agents beside the old curves"
     assert published.read(bare).curves[1, 1] != whole.curves[1, 1]

@@ -47,7 +47,7 @@ def flat(label: str, score: float, last: float | None = None) -> EntryResults:
     curves = np.full((20, 100), score)
     if last is not None:
         curves[:, 50:] = last
-    return replace(boards.entry(label), curves=curves)
+    return boards.changed(boards.entry(label), curves=curves)
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_the_picture_of_tiers_names_who_reached_nothing(mostly_at_the_cap: board
 
 def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     entries = boards.graded(2)
-    marked = [replace(entries[0], tuning={"steps": 1, "on_protocol_seeds": True}), entries[1]]
+    marked = [boards.changed(entries[0], tuning={"steps": 1, "on_protocol_seeds": True}), entries[1]]
     made = boards.of(marked)
     note = "settings chosen after seeing runs on protocol seeds, which may flatter"
     assert f"† {note}" in markdown(made)
@@ -176,7 +176,8 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
 
 def test_devices_that_mix_within_an_entry_are_named() -> None:
     one, two = boards.graded(2)
-    made = boards.of([replace(one, devices=("cpu", "cuda")), replace(two, devices=("cpu",))])
+    cpu, cuda = ({"device": {"kind": kind}} for kind in ("cpu", "cuda"))
+    made = boards.of([boards.changed(one, made_with=[cpu, cuda]), boards.changed(two, made_with=[cpu])])
     note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
     assert note in markdown(made).split("  \n")
     assert provenance.devices([{}, {"device": {"kind": "cuda", "name": "H100"}}]) == ("cpu", "cuda")
@@ -187,30 +188,34 @@ def test_the_board_says_where_settings_come_from() -> None:
     one, two, three = boards.graded(3)
     record = {"trials": 16, "seeds": "1000000:1000032", "changed": [], "budget": "8 settings per option"}
     identity = {"algorithm_options": {"lr": 2e-3}}
-    tuned, released = replace(one, tuning=record), replace(two, preset="released")
-    by_hand = replace(three, preset="released", identity=identity)
+    tuned, released = boards.changed(one, tuning=record), boards.changed(two, preset="released")
+    by_hand = boards.changed(three, preset="released", identity=identity)
     told = ["tuned (16 trials, 32 seeds)", "released", "released but lr"]
     assert [entry.settings for entry in (tuned, released, by_hand)] == told
-    assert replace(one, tuning={"changed": ["algorithm.lr"]}).settings == "tuned but lr"
-    assert replace(one, preset="released", algorithm="mine").settings == "default", "as older records have it"
-    assert replace(one, preset="mine.toml").settings == "mine.toml"
-    assert replace(one, tuning={"trials": None, "seeds": "1000000:?"}).settings == "tuned"
+    assert boards.changed(one, tuning={"changed": ["algorithm.lr"]}).settings == "tuned but lr"
+    assert boards.changed(one, preset="released", identity={"algorithm": "mine"}).settings == "default", (
+        "as older records have it"
+    )
+    assert boards.changed(one, preset="mine.toml").settings == "mine.toml"
+    assert boards.changed(one, tuning={"trials": None, "seeds": "1000000:?"}).settings == "tuned"
     mixed = "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
     text = markdown(boards.of([tuned, released, by_hand]))
     assert mixed in text.split("  \n")
     assert "| tuned (16 trials, 32 seeds) |" in text
-    equal = markdown(boards.of([tuned, replace(two, tuning=record)]))
+    equal = markdown(boards.of([tuned, boards.changed(two, tuning=record)]))
     assert mixed not in equal
     assert "different budgets" not in equal
     less = {**record, "budget": "2 settings per option"}
-    unequal = markdown(boards.of([tuned, replace(two, tuning=less)]))
+    unequal = markdown(boards.of([tuned, boards.changed(two, tuning=less)]))
     assert "different budgets: 2 settings per option; 8 settings per option" in unequal
 
 
 def test_what_tuning_took_is_said() -> None:
     one, two, three = boards.graded(3)
     tuning = {"trials": 7, "steps": 10_500_000, "core_hours": 0.12}
-    made = boards.of([replace(one, tuning=tuning), replace(two, tuning={"trials": None}), three])
+    made = boards.of(
+        [boards.changed(one, tuning=tuning), boards.changed(two, tuning={"trials": None}), three]
+    )
     text = f"{one.label} (7 trials, 10,500,000 steps, 0.12 core-hours), {two.label} (budget not known)"
     assert f"settings found by tuning: {text}" in markdown(made).split("  \n")
 

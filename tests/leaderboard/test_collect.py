@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
-from qrlsuite.errors import EnvironmentFailure
+from qrlsuite.errors import EnvironmentFailure, OptionError
 from qrlsuite.experiment import task as tasks
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.leaderboard.boards import board, ranked
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import DifferentCurvesError, EntryResults, SeedResult
+from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from tests.commands import say
 from tests.conftest import TINY, Train, trainer
+from tests.leaderboard import boards
 from tests.leaderboard.boards import entry as drawn
 from tests.leaderboard.boards import refused
 
@@ -65,9 +72,10 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     cell = ranking.reference.model_copy(update={"epsilon": 0.4, "delta": 0.3})
     other = ranking.model_copy(update={"epsilons": [0.4], "deltas": [0.3], "reference": cell})
     lying = task.file.model_copy(update={"ranking": other})
-    assert collect.current(lying, "beam6g", task.hash).ranking == ranking
-    assert collect.current(lying, "beam6g", "another definition") is lying
-    assert collect.current(lying, "not-installed", task.hash) is lying
+    told = {"task_file": lying, "task_name": "beam6g", "task_hash": task.hash}
+    assert collect.current(EntryRecord.model_construct(**told)).ranking == ranking
+    for change in ({"task_hash": "another definition"}, {"task_name": "not-installed"}):
+        assert collect.current(EntryRecord.model_construct(**{**told, **change})) is lying
     several = [drawn("mlp a"), drawn("mlp b"), drawn("mlp c")]
     object.__setattr__(several[0], "task_file", lying)
     for order in (several, several[::-1]):
@@ -165,3 +173,61 @@ def test_of_entries_below_every_horizon_the_length_of_half_of_them_counts() -> N
     assert lines == ["mlp d: ends at 10000 steps; --horizon 10000 shows it"]
     kept, lines = collect.equally_long([drawn("mlp a"), *(drawn(f"mlp {i}", epochs=20) for i in range(3))])
     assert [entry.label for entry in kept] == ["mlp a"], "the others do not reach the task's horizon"
+
+
+CURVES = np.random.default_rng(0).random((6, 5)).round(3)
+
+
+@st.composite
+def parts(draw: st.DrawFn) -> EntryResults:
+    """Some seeds of one entry, each with the first epochs of its curve."""
+    lengths = draw(st.dictionaries(st.integers(0, 5), st.integers(1, 5), min_size=1))
+    entry, folder = boards.entry("mlp a", 1), Path(draw(st.sampled_from("abc")))
+    results = {
+        seed: SeedResult(folder, CURVES[seed, :length], length, published=draw(st.booleans()))
+        for seed, length in sorted(lengths.items())
+    }
+    return EntryResults.of(entry.record, folder, results)
+
+
+def seen(entry: EntryResults) -> tuple[dict[int, tuple[float, ...]], int, list[list[float]]]:
+    return (
+        {seed: tuple(result.curve) for seed, result in entry.records.items()},
+        entry.epochs,
+        entry.curves.tolist(),
+    )
+
+
+@given(parts(), parts(), parts())
+def test_results_of_an_entry_add(a: EntryResults, b: EntryResults, c: EntryResults) -> None:
+    assert seen(a + b) == seen(b + a)
+    assert seen((a + b) + c) == seen(a + (b + c))
+    assert seen(a + a) == seen(a)
+    whole = a + b
+    assert list(whole.records) == sorted({*a.records, *b.records})
+    for seed, result in whole.records.items():
+        assert len(result.curve) == max(len(p.records[seed].curve) for p in (a, b) if seed in p.records)
+        assert any(result is p.records.get(seed) for p in (a, b)), "it says where it was read"
+
+
+@given(parts(), parts())
+def test_a_seed_with_two_curves_does_not_add_and_both_folders_are_named(
+    a: EntryResults, b: EntryResults
+) -> None:
+    assume(a.records.keys() & b.records.keys())
+    here = boards.changed(a, folder=Path("here"))
+    results = {s: replace(r, curve=r.curve + 1, folder=Path("there")) for s, r in b.records.items()}
+    there = replace(b, records=results)
+    for one, other in ((here, there), (there, here)):
+        with pytest.raises(DifferentCurvesError, match=r"seed \d has one curve in here and another in there"):
+            one + other
+
+
+def test_results_of_two_entries_do_not_add() -> None:
+    with pytest.raises(OptionError, match="'mlp a' and 'mlp b' are not the same entry"):
+        boards.entry("mlp a") + boards.entry("mlp b")
+    coded = boards.changed(
+        boards.entry("mlp a"), code=CodeIdentity(({"role": "model", "distribution": "x"},))
+    )
+    with pytest.raises(OptionError, match="are not the same entry"):
+        boards.entry("mlp a") + coded

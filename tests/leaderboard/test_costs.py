@@ -20,7 +20,8 @@ from tests.leaderboard import boards
 
 STEPS = 2000
 """Environment steps of an epoch."""
-PAID = {"epochs": 100, "executions": 1, "hours": 1}
+ALPHA, BETA = {"processor": "Alpha"}, {"processor": "Beta"}
+SHOTS = {"model_options": {"shots": 100}}
 
 
 def learner(
@@ -32,9 +33,8 @@ def learner(
     for run in range(seeds):
         curves[run, : epochs_below + run % 2] = 0
     executions = per_step * STEPS * epochs
-    paid = {"epochs": epochs, "executions": executions, "hours": executions / 3600}
-    known = {"clocked": False, "processors": ("Alpha",)}
-    return replace(entry, curves=curves, records=dict.fromkeys(range(seeds), paid), **{**known, **facts})
+    known = {"clocked": False, "made_with": [ALPHA], "executions": executions, "hours": executions / 3600}
+    return boards.changed(entry, curves=curves, **{**known, **facts})
 
 
 def section(*entries: EntryResults, by: str = "executions") -> costs.CostSection:
@@ -83,24 +83,22 @@ def test_equal_prices_are_compared_at_whole_epochs() -> None:
 @pytest.mark.parametrize(
     ("change", "by", "problem"),
     [
-        ({"records": {0: {**PAID, "executions": 0}}, "parameters": (9, 0)}, "executions", "executes no circuits"),
-        ({"records": {0: {**PAID, "executions": 0}}}, "executions", "in its record: its model counts none, or"),
+        ({"executions": 0, "parameters": {"classical": 9}}, "executions", "executes no circuits"),
+        ({"executions": 0}, "executions", "in its record: its model counts none, or"),
         ({}, "shots", "exact values, without shots"),
-        ({"records": {0: {**PAID, "hours": 0}}}, "core-hours", "no times in its record"),
-        ({"records": {}}, "core-hours", "no times in its record"),
+        ({"hours": 0}, "core-hours", "no times in its record"),
         ({"clocked": None}, "core-hours", "does not say whether its hours are processor time"),
         ({"clocked": True}, "core-hours", "hours by the clock"),
-        ({"processors": ("Alpha", "Beta")}, "core-hours", "made on Alpha, Beta"),
-        ({"processors": ()}, "core-hours", "its processor is not recorded"),
-        ({"processors": ("Beta",)}, "core-hours", "made on Beta, the others on Alpha"),
+        ({"made_with": [ALPHA, BETA]}, "core-hours", "made on Alpha, Beta"),
+        ({"made_with": []}, "core-hours", "its processor is not recorded"),
+        ({"made_with": [BETA]}, "core-hours", "made on Beta, the others on Alpha"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_compared_has_no_rank_and_a_reason(
     change: dict[str, Any], by: str, problem: str
 ) -> None:
-    options = {"model": {"shots": 100}}
-    others = [learner("one", 20, 2, options=options), learner("two", 30, 2, options=options)]
-    found = section(replace(learner("odd", 1, 0.1), **change), *others, by=by)
+    others = [learner("one", 20, 2, identity=SHOTS), learner("two", 30, 2, identity=SHOTS)]
+    found = section(learner("odd", 1, 0.1, **change), *others, by=by)
     assert labels(found) == ["one", "two", "odd"], "not first, whatever it would cost"
     assert [found.rank_text(row) for row in found.rows] == ["1", "2", "-"]
     assert problem in found.rows[2].price.problem
@@ -120,17 +118,17 @@ def test_numbers_that_cannot_be_compared_are_marked() -> None:
 
 def test_seeds_that_cost_differently_and_seeds_without_a_record() -> None:
     entry = learner("uneven", 20, 1)
-    records = {s: {**each, "executions": 1000 * (2 if s else 3)} for s, each in entry.records.items()}
+    records = {s: replace(each, executions=1000 * (2 if s else 3)) for s, each in entry.records.items()}
     found = section(replace(entry, records=records))
     assert any("up to 1.5 times as much in one seed" in line for line in found.notes())
-    records[0]["executions"] = 0
+    records[0] = replace(records[0], executions=0)
     found = section(replace(entry, records=records))
     assert found.rows[0].price.problem == "the records of some of its seeds hold no executions"
 
 
 def test_shots_are_executions_times_shots() -> None:
-    many, few = ({"model": {"shots": shots}} for shots in (1000, 10))
-    entries = [learner("many", 20, 1, options=many), learner("few", 40, 1, options=few)]
+    many, few = ({"model_options": {"shots": shots}} for shots in (1000, 10))
+    entries = [learner("many", 20, 1, identity=many), learner("few", 40, 1, identity=few)]
     assert labels(section(*entries)) == ["many", "few"]
     assert any("--by shots counts shots" in line for line in section(*entries).notes())
     found = section(*entries, by="shots")

@@ -28,6 +28,7 @@ from qrlsuite.training.evaluation import best_runs
 from qrlsuite.training.trainer import Trainer
 from tests.conftest import trainer
 from tests.environments.strangers import HERE
+from tests.leaderboard import boards
 
 WALK = f"""
 format_version = 1
@@ -66,15 +67,12 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, EntryResults
 
 def turned(entry: EntryResults, shift: float) -> EntryResults:
     """Another entry, which takes `shift` steps more."""
-    late = {seed: {"late": own["late"] + shift} for seed, own in entry.measured.items()}
-    return replace(
-        entry,
-        name="other",
-        label="ddqn other",
-        curves=entry.curves + shift,
-        measured=late,
-        folder=Path("other"),
-    )
+    results = {
+        seed: replace(result, curve=result.curve + shift, measured={"late": result.measured["late"] + shift})
+        for seed, result in entry.records.items()
+    }
+    other = boards.changed(entry, name="other", label="ddqn other")
+    return replace(other, records=results, folder=Path("other"))
 
 
 def test_steps_above_a_threshold_by_hand() -> None:
@@ -183,7 +181,7 @@ def test_what_cannot_be_ranked_is_refused(old: str, new: str, problem: str, tmp_
 
 def test_a_cost_that_was_not_measured_is_none(walked: tuple[Path, EntryResults]) -> None:
     _, entry = walked
-    without = replace(entry, measured={})
+    without = boards.changed(entry, measured={})
     assert board.build([without]).as_dict()["sections"][0]["rows"][0]["costs"] == {"late": None}
     with pytest.raises(OptionError, match="--by late: not every epoch of 'ddqn mlp"):
         board.build([without], by="late")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import doctest
 import io
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from qrlsuite import api
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard.boards import pair
 from qrlsuite.leaderboard.boards.compared import compare_entries, pair_table
-from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import BESIDE, EntryResults
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
 
@@ -27,8 +26,13 @@ def entry(
     curves = np.full((len(reached_at), 100), start)
     for run, epoch in enumerate(reached_at):
         curves[run, epoch:] = score
-    made = replace(boards.entry(label), curves=curves, folder=Path(label), name=label.replace(" ", "-"))
-    return replace(made, seeds=tuple(range(len(reached_at))))
+    return boards.changed(boards.entry(label), curves=curves, name=label.replace(" ", "-"))
+
+
+def begun_with(entry: EntryResults, epsilons: list[float]) -> EntryResults:
+    """An entry in whose record the task has other thresholds."""
+    ranking = entry.task_file.ranking.model_copy(update={"epsilons": epsilons})
+    return boards.changed(entry, task_file=entry.task_file.model_copy(update={"ranking": ranking}))
 
 
 def spread(around: int, count: int = 30) -> np.ndarray:
@@ -131,7 +135,7 @@ def test_the_board_of_more_entries_is_stricter() -> None:
     assert among.text.startswith(
         "on the board of 8 entries, which is stricter (28 pairs): not told apart, adjusted p = "
     )
-    renamed = replace(first, name="first-published", label="first (published)")
+    renamed = first.marked(BESIDE)
     assert pair.on_board(first, second, [renamed, second, *others], grid, 0.05) == among
     assert pair.on_board(first, second, [first, second], grid, 0.05) is None
     assert pair.on_board(first, few, [first, few, *others], grid, 0.05) is None
@@ -165,8 +169,8 @@ def test_published_entries_in_words(order: tuple[str, str]) -> None:
 
 def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:
     first, second = entry("first", spread(18)), entry("second", spread(38))
-    kept = first.task_file.ranking.grid.thresholds
-    changed, same = replace(first, first_thresholds=(0.9, 0.8)), replace(second, first_thresholds=kept[::-1])
+    kept = first.task_file.ranking.epsilons
+    changed, same = begun_with(first, [0.1, 0.2]), begun_with(second, kept[::-1])
     said = "thresholds changed after the first seed: first"
     assert any(each.startswith(said) for each in compare_entries(changed, same).remarks)
     named, unchanged = (boards.of([one, same]).sheets(explain=True)[0] for one in (changed, first))
@@ -185,9 +189,8 @@ def test_entries_whose_task_files_have_other_thresholds_than_the_board_are_named
     first, second, third = (
         entry(name, spread(18 + k)) for k, name in enumerate(("first", "second", "third"))
     )
-    ranking = first.task_file.ranking.model_copy(update={"epsilons": [0.5]})
-    older = first.task_file.model_copy(update={"ranking": ranking})
-    first = replace(first, task_file=older, first_thresholds=(0.5,))
+    first = begun_with(first, [0.5])
+    first = replace(first, task_file=first.record.task_file)
     [sheet] = boards.of([first, second, third]).sheets()
     assert "thresholds changed after the first seed: first (judged by 0.6, 0.65, " in sheet.markdown()
 

@@ -41,17 +41,18 @@ def learner(
     curves = np.zeros((seeds, epochs))
     curves[:, first_good:] = 0.95
     identity = {
-        "model_options": model_options or {}, "task": {"environment_options": environment_options or {}},
+        "model": label.split()[1], "model_options": model_options or {},
+        "task": {"environment_options": environment_options or {}},
     }  # fmt: skip
     made = boards.entry(label, seeds, epochs, quantum=quantum)
-    return replace(made, task=task, task_hash=task, model=label.split()[1], curves=curves, identity=identity)
+    return boards.changed(made, task_name=task, task_hash=task, curves=curves, identity=identity)
 
 
 def noisy(label: str, seeds: int = 30, level: float = 0.9) -> EntryResults:
     generator = np.random.default_rng(len(label))
     pace = generator.lognormal(2.5, 0.4, (seeds, 1))
     curves = level - level * np.exp(-np.arange(1, 101) / pace) + 0.03 * generator.normal(size=(seeds, 100))
-    return replace(learner(label, seeds=seeds), curves=np.clip(curves, 0, 1))
+    return boards.changed(learner(label, seeds=seeds), curves=np.clip(curves, 0, 1))
 
 
 def texts(figure: Figure) -> str:
@@ -80,8 +81,8 @@ def test_kinds_have_a_line_settings_and_a_drawing_function() -> None:
 @pytest.mark.parametrize("kind", [name for name, kind in pictures.KINDS.items() if kind.data == "entries"])
 def test_any_name_can_be_drawn_and_seeds_are_stated(kind: str) -> None:
     names = ["ddqn <b>$x^$ 50\\% & \ud800\x00\u202e", "ddqn mlp " + "long " * 40]
-    widths = ({"model_options": {"width": k + 1}} for k in range(2))
-    entries = [replace(noisy(name), model="mlp", identity=width) for name, width in zip(names, widths)]
+    widths = ({"model": "mlp", "model_options": {"width": k + 1}} for k in range(2))
+    entries = [boards.changed(noisy(name), identity=width) for name, width in zip(names, widths)]
     figure = pictures.draw(kind, entries)
     written = texts(figure)
     assert "30 seeds*" in written or "30 of 100 seeds" in written
@@ -146,7 +147,7 @@ def test_scaling_orders_by_size_with_a_panel_per_model() -> None:
 
 def test_scaling_bars_reach_from_the_5th_to_the_95th_percentile() -> None:
     entries = [noisy(f"ddqn mlp width={n}", level=level) for n, level in ((16, 0.9), (64, 0.95))]
-    entries = [replace(e, identity={"model_options": {"width": n}}) for e, n in zip(entries, (16, 64))]
+    entries = [boards.changed(e, identity={"model_options": {"width": n}}) for e, n in zip(entries, (16, 64))]
     grid = Grid.relative([0.2], [0.5])
     axes = pictures.draw("scaling", entries, epsilons=[0.2], deltas=[0.5]).axes[0]
     for entry, drawn in zip(entries, axes.containers, strict=True):
@@ -256,7 +257,7 @@ def test_curves_have_the_scores_of_policies_whose_names_do_not_lie_on_each_other
 
 
 def test_a_curve_of_one_epoch_can_be_seen() -> None:
-    both = [learner(seeds=3), replace(learner("ddqn mlp width=8"), curves=learner().curves[:, :1])]
+    both = [learner(seeds=3), boards.changed(learner("ddqn mlp width=8"), curves=learner().curves[:, :1])]
     lines = labeled(pictures.draw("curves", both).axes[0])
     markers = [
         line.get_marker() for each in both for line in lines if line.get_label().startswith(each.label)

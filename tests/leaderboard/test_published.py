@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from qrlsuite import api, registry, specs
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards import board, costs
@@ -31,10 +32,11 @@ from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
 from qrlsuite.leaderboard.shelf.curves import edited_between
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, table_bytes
 from qrlsuite.studies.study import parse
 from tests.commands import say
 from tests.conftest import TINY, Train, trainer
+from tests.leaderboard import boards
 from tests.leaderboard.boards import refused
 
 EPOCHS = 3
@@ -592,21 +594,30 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     monkeypatch.setattr(published, "PUBLISHED", tmp_path / "entries")
     train("mine", range(2), EPOCHS)
     entries, refused = collect.collect(collect.Selection(tmp_path / "mine", published=True))
-    assert [len(entry.seeds) for entry in entries] == [8]
-    assert "2 seeds of 3 epochs; shown are 8 seeds of 3 epochs of the same entry, from" in refused[0]
-    other = dataclasses.replace(entries[0], name="another", folder=tmp_path)
-    compared = api.compare(entries[0].name, other, task="tiny", runs=tmp_path / "mine", published=True)
+    assert ([len(entry.seeds) for entry in entries], refused) == ([8], [])
+    train("mine", range(9), EPOCHS)
+    [entry], refused = collect.collect(collect.Selection(tmp_path / "mine", published=True))
+    assert (entry.seeds, entry.source, refused) == (tuple(range(9)), "runs and published", []), (
+        "the seeds of both"
+    )
+    assert [record.published for record in entry.records.values()] == [True] * 8 + [False]
+    table = EntryStore(tmp_path / "mine" / "tiny" / entry.name).seed(0).table
+    table.write_bytes(table_bytes([{"epoch": epoch, "score": 0.5} for epoch in range(1, EPOCHS + 1)]))
+    [entry], refused = collect.collect(collect.Selection(tmp_path / "mine", published=True))
+    assert (len(entry.seeds), entry.source) == (9, "runs"), "where a seed differs, the copy with more seeds"
+    assert refused[0].startswith("seed 0 has one curve in ")
+    assert str(folder) in refused[0]
+    assert str(tmp_path / "mine") in refused[0]
+    assert refused[0].endswith(f"shown are 9 seeds of 3 epochs of the same entry, from {entry.folder}")
+    other = dataclasses.replace(boards.changed(entry, name="another"), folder=tmp_path)
+    compared = api.compare(entry.name, other, task="tiny", runs=tmp_path / "mine", published=True)
     assert compared.remarks[-1] == f"left out: {refused[0]}"
-    assert not edited_between(entries[0], other)
-    first, second = (
-        dataclasses.replace(entry, environments=frozenset("ab")) for entry in (entries[0], other)
-    )
-    assert not edited_between(first, dataclasses.replace(second, environments=frozenset("b"))), (
-        "joined by --same"
-    )
-    assert "was edited between" in edited_between(
-        first, dataclasses.replace(second, environments=frozenset("c"))
-    )
+    assert not edited_between(entry, other)
+    a, b, c = (CodeIdentity(({"role": "environment", "name": name, "distribution": "x"},)) for name in "abc")
+    both = (dataclasses.replace(result, code=code) for result, code in zip(entry.records.values(), (a, b)))
+    first = dataclasses.replace(entry, records=dict(enumerate(both)))
+    assert not edited_between(first, boards.changed(other, code=b)), "joined by --same"
+    assert "was edited between" in edited_between(first, boards.changed(other, code=c))
     train("short", range(9), 1)
     entries, refused = collect.collect(collect.Selection(tmp_path / "short", published=True))
     assert [(entry.curves.shape, "(published)" in entry.label) for entry in entries] == [

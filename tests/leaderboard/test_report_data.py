@@ -149,7 +149,7 @@ def test_names_are_cut_and_lose_what_no_escaping_helps_against() -> None:
 
 def test_equal_labels_are_told_apart() -> None:
     twins = [boards.entry("same", 20), boards.entry("same", 21)]
-    named = [dataclasses.replace(twin, name=f"same-{i}") for i, twin in enumerate(twins, 1)]
+    named = [boards.changed(twin, name=f"same-{i}") for i, twin in enumerate(twins, 1)]
     assert [view.label for view in entries.views(named)] == ["same (same-1)", "same (same-2)"]
 
 
@@ -201,11 +201,13 @@ def test_boards_are_counted_and_a_circuit_is_set_against_the_network_of_its_size
     def drawn(task: str, circuit: float) -> list[EntryResults]:
         made = [boards.entry(f"mlp width={n}", speed=v, task=task) for n, v in ((99, 3), (9, 2), (11, 1))]
         made = [
-            dataclasses.replace(each, parameters=(n, 0))
+            boards.changed(each, parameters={"classical": n})
             for each, n in zip(made, (1000, 90, 110), strict=True)
         ]
         circuits = [
-            dataclasses.replace(boards.entry(f"vqc{n}", speed=v, task=task), parameters=(60, 40))
+            boards.changed(
+                boards.entry(f"vqc{n}", speed=v, task=task), parameters={"classical": 60, "quantum": 40}
+            )
             for n, v in ((0, circuit), (1, 9), (2, 9))
         ]
         for each, at in zip(circuits, (None, "model_options", "ansatz_options")):
@@ -244,9 +246,7 @@ def test_every_published_entry_is_one_click_from_its_commands(task: str) -> None
 def test_a_board_is_cited_by_what_it_ranks() -> None:
     """The hash follows a score and no order, and JSON has it; names of files are no markup in a badge."""
     one, other = boards.entry("<b>fast</b>", speed=2), boards.entry("slow", speed=0.5)
-    changed = dataclasses.replace(
-        other, curves=np.where(other.curves == other.curves.max(), 0.5, other.curves)
-    )
+    changed = boards.changed(other, curves=np.where(other.curves == other.curves.max(), 0.5, other.curves))
     board = boards.of([one, other])
     ((section,), (forged,)) = (boards.of(each).sections for each in ([one, other], [one, changed]))
     content = section.hash

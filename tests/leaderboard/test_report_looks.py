@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +102,9 @@ def test_times_of_the_log_are_written_to_the_minute() -> None:
 def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], runs: Path, width: int) -> None:
     entries = []
     for task in ("beam6g", "cartpole"):
-        entries += [replace(each, task=task, task_hash=task) for each in boards.graded(2, seeds=30)]
+        entries += [
+            boards.changed(each, task_name=task, task_hash=task) for each in boards.graded(2, seeds=30)
+        ]
     compared = board.build(entries, together=["beam6g", "cartpole"])
     page = render(board.build(entries), studies=in_folder(runs)[0], beside=compared)
     tab = opened(page, width=width)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.report import render
+from qrlsuite.results.records import ImportedRecord
 from tests.leaderboard import boards
 
 Open = Callable[..., Any]
@@ -109,7 +109,7 @@ def test_a_board_of_three_begins_with_every_pair(opened: Open) -> None:
 
 def test_what_another_program_trained_is_neither_classical_nor_quantum(opened: Open) -> None:
     entries = [boards.entry(f"at {speed}", speed=speed, quantum=9 * (speed == 1)) for speed in (3, 2, 1, 0.5)]
-    tab = opened(boards.of([dataclasses.replace(entries[0], external=True), *entries[1:]]))
+    tab = opened(boards.of([boards.changed(entries[0], imported=ImportedRecord()), *entries[1:]]))
     assert "external" in tab.locator("#board-0-table tbody tr").first.inner_text()
     assert tab.locator(".answers .said span").inner_text().startswith("classical at 2 needs ")
     assert "Curves that other programs made" in tab.locator("#board-0-notes").inner_text()
@@ -374,17 +374,19 @@ def test_an_entry_has_one_color_in_every_picture_and_bands_are_those_of_a_few(op
 
 def test_the_legend_names_the_ansatz(opened: Open) -> None:
     options = {"model_options": {"qubits": 4, "ansatz": "iqp"}}
-    entry = dataclasses.replace(boards.entry("ddqn vqc-native qubits=4", quantum=96), identity=options)
+    entry = boards.changed(boards.entry("ddqn vqc-native qubits=4", quantum=96), identity=options)
     tab = opened(boards.of([entry, boards.entry("ddqn mlp width=16")]))
     assert sorted(picked(tab)) == ["mlp width=16", "vqc-native qubits=4 ansatz=iqp"]
-    hostile = dataclasses.replace(entry, identity={"model_options": {"ansatz": boards.HOSTILE[0]}})
+    hostile = boards.changed(entry, identity={"model_options": {"ansatz": boards.HOSTILE[0]}})
     assert boards.HOSTILE[0] not in render(boards.of([hostile]))
 
 
 @pytest.mark.parametrize("external", [False, True])
 def test_two_entries_of_few_seeds_have_a_verdict_and_an_axis(opened: Open, external: bool) -> None:
     few = [boards.entry(label, 10, speed=speed) for label, speed in (("one", 3), ("other", 1))]
-    tab = opened(boards.of([dataclasses.replace(entry, external=external) for entry in few]))
+    tab = opened(
+        boards.of([boards.changed(entry, imported=ImportedRecord() if external else None) for entry in few])
+    )
     (said,) = tab.locator("#board-0 .verdicts .verdict").all_inner_texts()
     assert said.startswith("undecided: fewer than 20 seeds (10 seeds each); so far one")
     axis = tab.locator("#board-0 .plot svg").first.text_content()

@@ -40,7 +40,7 @@ def reaching(label: str, *steps: tuple[float, float], seeds: int = 20, spread: i
     for run in range(seeds):
         for score, epoch in steps:
             curves[run, int(epoch) + run % spread :] = score
-    return replace(boards.entry(label, seeds), curves=curves)
+    return boards.changed(boards.entry(label, seeds), curves=curves)
 
 
 def times_of(*entries: EntryResults, alpha: float = 0.05) -> Any:
@@ -304,7 +304,7 @@ def test_latex_prints_every_name_as_it_is(text: str) -> None:
     spelled = r"\\text[a-z]+\{\}|\\symbol\{\d+\}|\{\[\}|\{\]\}|-\{\}-|\\[&%$#_{}]"
     assert not set(re.sub(spelled, "", shown)) & set("\\&%$#_{}~^<>|\"`'[]"), shown
     assert "--" not in shown
-    (made,) = boards.of([replace(boards.entry("x", 20), label=text), boards.entry("plain")]).sheets()
+    (made,) = boards.of([boards.changed(boards.entry("x", 20), label=text), boards.entry("plain")]).sheets()
     written = made.latex()
     rows = [line for line in written.splitlines() if line.endswith(r"\\")]
     assert [len(re.findall(r"(?<!\\)&", row)) for row in rows] == [9, 9, 9]
@@ -353,7 +353,7 @@ def test_sections_of_several_tasks_have_their_own_rules() -> None:
     assert rules == {"beam6g": "times", "cartpole": "intervals"}
     assert set(made.rules) == {"intervals", "times"}
     assert "<q>times, intervals</q>" in report.render(made)
-    assert compare_entries(ruled, replace(ruled, name="b")).rule == "times"
+    assert compare_entries(ruled, boards.changed(ruled, name="b")).rule == "times"
 
 
 def test_an_unknown_rule_is_one_line_with_the_nearest(tmp_path: Path) -> None:

@@ -96,9 +96,9 @@ def leaderboard(
     --rule paper ranks by the paper's definition instead: tiers of significant outperformance in the cells of the
     task's grid, by intervals of the sample complexity.
 
-    With --published, your own copy of a published entry is shown too if it has fewer epochs. Several --task compare
-    the entries that were trained on all of them with the same options. The page also shows the studies
-    with looks in the results folder.
+    With --published, your own seeds of a published entry are added to it, or shown beside it if they have fewer
+    epochs. Several --task compare the entries that were trained on all of them with the same options. The page
+    also shows the studies with looks in the results folder.
 
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all; --entry then compares these alone. Entries whose record does not hold the cost, or not so
