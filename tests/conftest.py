@@ -222,7 +222,7 @@ class Holding:
 
     def epoch_finished(self, run, record):
         mark = SITE / f"held-{os.getpid()}"
-        if mark.exists():
+        if mark.exists() or record["epoch"] < int(os.environ.get("HOLD_IN_EPOCH", "1")):
             return
         asked = []
         before = signal.signal(signal.SIGTERM, lambda *given: asked.append(given))
@@ -238,6 +238,7 @@ class Holding:
 class Hold:
     """A plugin that holds each worker at the end of its first epoch, until it is stopped or all are released.
 
+    `HOLD_IN_EPOCH` of a command's environment names a later epoch.
     However fast or slow a machine is, what is to be interrupted has begun and has not ended.
 
     Attributes

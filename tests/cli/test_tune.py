@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -12,12 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.errors import QrlSuiteError
-from qrlsuite.results.store import EntryStore
-from qrlsuite.tuning import search
-from tests.commands import answer, qrlsuite, say, start
+from tests.commands import qrlsuite, say, start
 from tests.conftest import HANGS, Hold
-from tests.core.test_tuning import finish, request, varied, without_hours
 
 pytestmark = pytest.mark.usefixtures("forked_workers")
 
@@ -29,71 +24,6 @@ def stop(words: list[str], hold: Hold, sign: signal.Signals) -> tuple[int, str]:
     os.kill(process.pid, sign)
     _, message = process.communicate(timeout=HANGS)
     return process.wait(), message
-
-
-def test_killed_and_interrupted_it_ends_with_the_same_preset(
-    tiny_task: str, tmp_path: Path, hold: Hold
-) -> None:
-    wanted = request(tiny_task, varied=varied("lr=1e-2,1e-3"), seeds=search.tuning_seeds("1"), epochs=8)
-    straight = search.Search(wanted, tmp_path / "straight")
-    finish(straight)
-    straight.write(straight.path)
-
-    words = ["tune", "mlp width=4 depth=1", "--task", tiny_task]
-    words += ["--vary", "lr=1e-2,1e-3", "--seeds", "1", "--epochs", "8", "--workers", "1"]
-    words += ["--runs", str(tmp_path / "stopped")]
-    trials = tmp_path / "stopped" / "tuning"
-    code, _ = stop(words, hold, signal.SIGKILL)
-    assert code == -signal.SIGKILL
-    code, message = stop(words, hold, signal.SIGINT)
-    assert code == 130, message
-    assert "The same command continues from there" in " ".join(message.split())
-    assert not list(trials.glob("*.toml")), "no preset before all trials have ended"
-
-    done = qrlsuite(*words, "--json")
-    assert done.returncode == 0, done.stderr
-    content = json.loads(done.stdout)
-    (found,) = content["searches"]
-    assert content["complete"]
-    assert len(found["trials"]) == 2
-    path = Path(found["preset"])
-    assert path.name == straight.path.name
-    assert without_hours(path.read_text()) == without_hours(straight.path.read_text())
-
-    used = qrlsuite(
-        "run", "mlp", f"preset={path}", "--task", tiny_task, "--seeds", "1", "--epochs", "1",
-        "--runs", str(tmp_path / "runs"), "--json",
-    )  # fmt: skip
-    assert used.returncode == 0, used.stderr
-    store = EntryStore(Path(json.loads(used.stdout)["folder"]))
-    assert store.record().tuning.seeds == "1000000:1000001"
-    shown = answer("show", str(store.path))
-    for name in (store.path.name, f"{store.path.parent.name}/{shown['label']}"):
-        assert answer("show", name, "--runs", str(store.path.parents[1])) == shown
-    assert shown["tuning"]["trials"] == 2
-
-
-def test_two_models_with_equal_budgets(tiny_task: str, tmp_path: Path) -> None:
-    words = ["tune", "mlp width=4 lr=1e-2", "mlp width=5 depth=1 lr=1e-2", "--task", tiny_task]
-    words += ["--vary", "lr=1e-2,1e-3,1e-4", "--vary", "gamma=.9,.99"]
-    words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
-    done = qrlsuite(*words)
-    assert done.returncode == 0, done.stderr
-    assert re.search(
-        r"trials of ddqn mlp width=4 .* and ddqn mlp width=5 depth=1 .*: 2 \(2 runs", done.stdout
-    )
-    assert done.stdout.count("next: qrlsuite run") == 2
-    searches = answer(*words)["searches"]
-    assert [len(each["trials"]) for each in searches] == [2, 2]
-    assert {"algorithm.gamma"} == set(searches[0]["space"]), "an option that is written is not varied"
-
-
-def test_it_says_the_size_first_and_wants_large_searches_confirmed(tiny_task: str, tmp_path: Path) -> None:
-    words = ["tune", "mlp", "--task", tiny_task, "--vary", "paper", "--runs", str(tmp_path / "runs")]
-    assert "2,160 trials" in say(*words, "--dry-run").stderr
-    with pytest.raises(QrlSuiteError, match="--yes starts them all"):
-        say(*words)
-    assert not (tmp_path / "runs").exists()
 
 
 def test_a_search_that_is_stopped_leaves_the_best_settings_so_far(
