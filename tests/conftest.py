@@ -74,6 +74,7 @@ def chromium() -> Iterator[Any]:
 
 
 LONGEST = (
+    "journeys/test_journeys.py",
     "testing/test_builtins.py",
     "cli/test_new.py",
     "cli/test_cli.py",
