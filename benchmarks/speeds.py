@@ -99,7 +99,7 @@ def measure(task: str, algorithm: str, model: str, options: dict[str, int], seed
 def _seconds(entry: Entry, seeds: int, epochs: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         store = EntryStore.create(Path(folder), entry)
-        GroupRun(entry, store, range(seeds), epochs).run()
+        GroupRun([(entry, store, range(seeds))], epochs).run()
         lines = read_lines(store.seed(0).timings)
     return statistics.median(float(line["cpu"]) for line in lines[len(lines) // 2 :])
 

@@ -65,7 +65,7 @@ def measure(task: str, seeds: int, epochs: int, runs: Path) -> dict[str, Any]:
         setattr(owner, method, clocked(seconds, name, getattr(owner, method)))
     store = EntryStore.create(runs, resolve(task, "mlp"))
     began = time.process_time()
-    GroupRun(store.entry(), store, range(seeds), epochs).run()
+    GroupRun([(store.entry(), store, range(seeds))], epochs).run()
     total = time.process_time() - began
     mean = {name: sum(values) / len(values) for name, values in seconds.items()}
     period = max(group.CHECKPOINT_SECONDS, mean["epoch"])
@@ -122,7 +122,7 @@ def store_untrained(models: int, seeds: int, epochs: int, task: str, runs: Path)
         entry = resolve(task, f"mlp width=16 algorithm.buffer=1 algorithm.lr={1e-4 * (model + 1):g}")
         store = EntryStore.create(runs, entry)
         for first in range(0, seeds, 50):
-            GroupRun(entry, store, range(first, min(first + 50, seeds)), epochs).run()
+            GroupRun([(entry, store, range(first, min(first + 50, seeds)))], epochs).run()
     total, clock = time.process_time() - began, time.perf_counter() - clock
     files = [path.stat().st_size for path in runs.rglob("*") if path.is_file()]
     each = models * seeds

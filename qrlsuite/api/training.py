@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
 from qrlsuite.engine import missing
+from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.where import Where
+from qrlsuite.engine.work import Missing
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import collect
@@ -21,6 +22,7 @@ from qrlsuite.notation import Written
 from qrlsuite.options import Setting, from_mapping
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.results.store import plugins_in
+from qrlsuite.results.survey import groups
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning.display import TuneDisplay
@@ -117,10 +119,10 @@ def train(
     """
     entry = resolve_entry(task, model, algorithm, from_mapping(options), preset, runs)
     where = where_of(engine, workers, device, fresh, same)
-    done = train_entry(entry, where, seeds, epochs, budget, track, runs, progress, start=start)
-    if done.submitted is not None and progress:
-        print(done.submitted, file=sys.stderr)
-    return collect.read(done.work.store)
+    work, submitted = train_entry(entry, where, seeds, epochs, budget, track, runs, progress, start=start)
+    if submitted is not None and progress:
+        print(submitted, file=sys.stderr)
+    return collect.read(work.store)
 
 
 def resolve_entry(
@@ -157,24 +159,39 @@ def train_entry(
     progress: bool,
     confirmed: bool = True,
     start: str | None = None,
-) -> missing.Training:
-    """Train the missing seeds of an entry: `train`, and the command `run`.
+) -> tuple[Missing, str | None]:
+    """Train the missing seeds of an entry, as `train` and the command `run` do, and print a summary.
 
     Parameters
     ----------
     confirmed:
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
+
+    Returns
+    -------
+    tuple
+        What was missing when it began; and one line about what was handed to a queue, None where it was trained.
     """
+    folder, quiet = Path(runs), not progress
     seed_numbers = None if seeds is None else read_seeds(seeds)
     check_positive("epochs", epochs)
     if start is not None:
         from qrlsuite.api.warm import begin_with  # torch
 
-        entry = begin_with(entry, Path(runs), start, seed_numbers)
+        entry = begin_with(entry, folder, start, seed_numbers)
+    missing.check_budget(budget, where)
+    [code] = missing.require_same_code(folder, [entry], where, quiet)
+    work = missing.find(folder, entry, where, seed_numbers, epochs)
+    if work.groups:
+        missing.require_trainable([entry], where)
+    display = RunDisplay(work, where.workers, quiet)
+    display.expected = None if quiet else missing.expected(work, where)
     with trackers.asking([track] if isinstance(track, str) else list(track)):
-        return missing.run(
-            Path(runs), entry, where, seed_numbers, epochs, budget, confirmed, quiet=not progress
-        )
+        submitted = missing.train(work, where, display, budget, confirmed, code).submitted
+    if submitted is None and not quiet and display.again == "command":
+        at_work = [group for group in groups(work.store) if group.state in ("running", "submitted")]
+        display.finished(missing.summarize(work), [group for group in at_work if {*group.seeds} & work.busy])
+    return work, submitted
 
 
 def tune(
@@ -250,32 +267,11 @@ def tune(
     >>> entry = train("beam6g", f"mlp preset={small.written}")  # doctest: +SKIP
     """
     where = where_of(engine, workers, device, fresh, same)
-    tuning = plan_tuning(
+    searches, display, path = plan_tuning(
         task, several(entries), vary, sampler, seeds, epochs, objective, budget, out, where, runs, progress
     )
-    tuning.run()
-    return tuning.searches
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """Searches that are about to run, and whose size and cost were shown.
-
-    Attributes
-    ----------
-    out:
-        The preset file of the one search; None takes one below `runs` for each.
-    """
-
-    searches: list[Search]
-    runs: Path
-    where: Where
-    display: TuneDisplay
-    out: Path | None
-
-    def run(self) -> bool:
-        """Run the trials and write presets; returns whether all trials are over, see `qrlsuite.tuning.runner.run`."""
-        return tuning_runner.run(self.searches, self.runs, self.where, self.display, self.out)
+    tuning_runner.run(searches, Path(runs), where, display, path)
+    return searches
 
 
 def plan_tuning(
@@ -291,15 +287,21 @@ def plan_tuning(
     where: Where,
     runs: str | PathLike[str],
     progress: bool,
-) -> Tuning:
-    """Build the searches that `tune` and the command run, and show them; the arguments are those of `tune`."""
+) -> tuple[list[Search], TuneDisplay, Path | None]:
+    """Build the searches that `tune` and the command run, and show them; the arguments are those of `tune`.
+
+    Returns
+    -------
+    tuple
+        The searches, what shows them, and the preset file of a single search, None for one below `runs` of each.
+    """
     check_positive("epochs", epochs)
     requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective, budget)
     path = preset_path(out, requests)
     searches = tuning_runner.build(requests, Path(runs))
     display = TuneDisplay(searches, where, not progress)
     display.begin()
-    return Tuning(searches, Path(runs), where, display, path)
+    return searches, display, path
 
 
 def evaluate(

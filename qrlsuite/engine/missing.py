@@ -1,7 +1,4 @@
-"""Finds the missing seeds of an entry, has them trained, reports the outcome.
-
-Everything that trains goes through here: `run`, `tune` and `study` on the command line, and `qrlsuite.api`.
-"""
+"""Finds the missing seeds of an entry, has them trained, reports the outcome: for `run`, `tune` and `study`."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import shutil
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +28,6 @@ from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup, plan_groups
 from qrlsuite.results.store import EntryStore
-from qrlsuite.results.survey import groups
 from qrlsuite.results.text import duration_range
 from qrlsuite.statistics.curves import reached
 from qrlsuite.training import device as devices
@@ -63,61 +58,6 @@ def find(
     if missing and isinstance(where.engine, RemoteEngine):
         missing = plan_groups(store, left, last, where.workers, remote.seeds_per_task(entry))
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
-
-
-@dataclass(frozen=True)
-class Training:
-    """What a training came to.
-
-    Attributes
-    ----------
-    work:
-        The missing seeds when it began.
-    submitted:
-        One line about seeds handed to a queue; None if they were trained.
-    """
-
-    work: Missing
-    submitted: str | None
-
-    def summary(self) -> dict[str, Any]:
-        """Return a summary of the finished seeds as plain values."""
-        return summarize(self.work)
-
-
-def run(
-    runs: Path,
-    entry: Entry,
-    where: Where,
-    seeds: Sequence[int] | None = None,
-    epochs: int | None = None,
-    budget: str | None = None,
-    confirmed: bool = True,
-    quiet: bool = False,
-) -> Training:
-    """Train an entry's missing seeds and print a summary.
-
-    Parameters
-    ----------
-    seeds, epochs:
-        As for `find`.
-    budget, confirmed:
-        As for `train`.
-    quiet:
-        Whether to show nothing.
-    """
-    check_budget(budget, where)
-    [code] = require_same_code(runs, [entry], where, quiet)
-    work = find(runs, entry, where, seeds, epochs)
-    display = RunDisplay(work, where.workers, quiet)
-    display.expected = None if quiet else expected(work, where)
-    if work.groups:
-        require_trainable([entry], where)
-    outcome = train(work, where, display, budget, confirmed, code)
-    if outcome.submitted is None and not quiet and display.again == "command":
-        at_work = [group for group in groups(work.store) if group.state in ("running", "submitted")]
-        display.finished(summarize(work), [group for group in at_work if {*group.seeds} & work.busy])
-    return Training(work, outcome.submitted)
 
 
 def require_same_code(

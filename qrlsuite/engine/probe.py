@@ -45,6 +45,7 @@ from qrlsuite.results.store import EntryStore, read_arrays
 from qrlsuite.training.remote_task import pack, unpack
 
 if TYPE_CHECKING:
+    from qrlsuite.training.group import Part
     from qrlsuite.training.trainer import Trainer
 
 MOST_EPOCHS = 10
@@ -264,7 +265,7 @@ class Probe:
         return len(together.lines), together.changed, difference(together, alone), cpu
 
 
-def prepare(parts: Sequence[tuple[EntryStore, Sequence[int]]], epochs: int, device: str) -> Probe | None:
+def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
     """Return the probe that a group is to make; None where none is needed, or another process makes it.
 
     Seeds for tuning are not probed: nothing ranks them.
@@ -272,11 +273,10 @@ def prepare(parts: Sequence[tuple[EntryStore, Sequence[int]]], epochs: int, devi
     Parameters
     ----------
     parts:
-        The group's seeds, by the folder of their entry.
+        As for `qrlsuite.training.group.GroupRun`.
     """
-    agents = [(store, seed) for store, seeds in parts for seed in seeds]
-    store, seed = agents[len(agents) // 2]
-    entry = store.entry()
+    agents = [(entry, store, seed) for entry, store, seeds in parts for seed in seeds]
+    entry, store, seed = agents[len(agents) // 2]
     if not entry.third_party() or seed >= TUNING_SEEDS:
         return None
     key = {"result": EQUAL, "device": device.partition(":")[0], "code": code_of(entry)}

@@ -182,7 +182,9 @@ class _Run:
         """Make the entry's probe here, where one is needed: both sides are trained in fresh processes."""
         probes.require_independent(self.store)
         first = self.members[0]
-        probe = probing.prepare([(self.store, first.group.seeds)], self.work.epochs, self.work.device)
+        probe = probing.prepare(
+            [(self.entry, self.store, first.group.seeds)], self.work.epochs, self.work.device
+        )
         if probe is None:
             return
         try:

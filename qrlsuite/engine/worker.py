@@ -72,7 +72,7 @@ def train_group(
     others:
         Folders of further entries whose seeds are trained in the same population.
     """
-    from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
+    from qrlsuite.training.group import GroupRun, Part  # torch, which a supervisor does without
 
     claims: list[Claim] = []
     heartbeat = ClaimHeartbeat(claims, parent)
@@ -91,7 +91,7 @@ def train_group(
     state = Progress(epochs=epochs)
     taken: SeedsClaimedError | None = None
     try:
-        parts: dict[int, list[tuple[EntryStore, Sequence[int]]]] = {}
+        parts: dict[int, list[Part]] = {}
         for store in map(EntryStore, (folder, *others)):
             try:
                 claims.append(acquire(store, seeds))
@@ -101,12 +101,12 @@ def train_group(
             files[store.path] = ProgressFile(store, group_id(seeds))
             probes.require_independent(store)
             for group in plan_groups(store, seeds, epochs, workers=1):
-                parts.setdefault(group.epoch, []).append((store, group.seeds))
-        for _, [(store, own), *further] in sorted(parts.items()):
-            probe = probing.prepare([(store, own), *further], epochs, device)
+                parts.setdefault(group.epoch, []).append((store.entry(), store, group.seeds))
+        for _, together in sorted(parts.items()):
+            probe = probing.prepare(together, epochs, device)
             if probe is not None:
                 claims.append(probe.claim)
-            run = GroupRun(store.entry(), store, own, epochs, device, report, further, held, probe)
+            run = GroupRun(together, epochs, device, report, held, probe)
             places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress
             run.run()

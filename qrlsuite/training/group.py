@@ -232,6 +232,10 @@ def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[A
     return made_with if origin in made_with else [*made_with, origin]
 
 
+Part = tuple[Entry, store.EntryStore, Sequence[int]]
+"""An entry, its folder, and those of its seeds that a group trains."""
+
+
 def _required_code(entry: Entry, entry_store: store.EntryStore) -> CodeIdentity:
     """Return the identity of the code here, unless another one was sent to train the entry or has begun it."""
     code = identity.of(entry)
@@ -245,19 +249,15 @@ class GroupRun:
 
     Parameters
     ----------
-    entry, entry_store:
-        The entry to run, and its folder.
-    seeds:
-        Protocol seeds; all at the same epoch.
+    parts:
+        The entries, their folders and seeds, all at the same epoch. Several entries are trained in one population, with
+        the results of separate training.
     epochs:
         The epoch at which to stop.
     device:
         Where the populations live: `cpu`, `cuda` or `cuda:1`.
     report:
         Called after every round with the group's progress.
-    others:
-        Folders of further entries, each with its seeds at this epoch: they are trained in the same population, with the
-        results of separate training.
     held:
         Whether the seeds are still this process's own; nothing is written any more once they are not.
     probe:
@@ -271,22 +271,18 @@ class GroupRun:
 
     def __init__(
         self,
-        entry: Entry,
-        entry_store: store.EntryStore,
-        seeds: Sequence[int],
+        parts: Sequence[Part],
         epochs: int,
         device: str = "cpu",
         report: Report = lambda progress: None,
-        others: Sequence[tuple[store.EntryStore, Sequence[int]]] = (),
         held: Callable[[], bool] = lambda: True,
         probe: GroupProbe | None = None,
     ) -> None:
         self.epochs, self.held, self.probe = epochs, held, probe
-        parts = [(entry, entry_store, seeds), *((other.entry(), other, own) for other, own in others)]
-        found = [_required_code(*part[:2]) for part in parts]
+        found = [_required_code(entry, entry_store) for entry, entry_store, _ in parts]
         self.trainer = Trainer(
-            [own for own, _, part in parts for _ in part],
-            [seed for *_, part in parts for seed in part],
+            [entry for entry, _, seeds in parts for _ in seeds],
+            [seed for *_, seeds in parts for seed in seeds],
             device,
             report,
         )

@@ -227,7 +227,7 @@ def stranger(tmp_path: Path) -> Callable[..., Entry]:
 
 def train(entry: Entry, folder: Path, seeds: list[int], epochs: int = 4) -> EntryStore:
     store = EntryStore.create(folder, entry)
-    group.GroupRun(entry, store, seeds, epochs).run()
+    group.GroupRun([(entry, store, seeds)], epochs).run()
     return store
 
 
@@ -269,9 +269,9 @@ def test_an_environment_that_raises_fails_its_group_and_keeps_finished_epochs(
         EnvironmentFailure,
         match=r"environment 'gym' failed: ZeroDivisionError: the cart left the rails .*strangers.py, line .*; finished",
     ):
-        group.GroupRun(entry, store, [0], 4).run()
+        group.GroupRun([(entry, store, [0])], 4).run()
     assert [row["epoch"] for row in store.seed(0).epochs()] == [1, 2]
-    group.GroupRun(entry, store, [0], 4).run()
+    group.GroupRun([(entry, store, [0])], 4).run()
     undisturbed = train(entry, tmp_path / "undisturbed", [0])
     assert results(store.path, 0) == results(undisturbed.path, 0)
 

@@ -176,12 +176,12 @@ def test_a_probe_that_is_ended_costs_nothing(acme: Acme, end: signal.Signals) ->
 def test_what_needs_no_probe(acme: Acme, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = resolve(acme.task, "mlp")
     store = EntryStore.create(acme.folder / "runs", entry)
-    assert probe.prepare([(store, [0, 1, 2])], 3, "cpu") is None, "built-in"
+    assert probe.prepare([(store.entry(), store, [0, 1, 2])], 3, "cpu") is None, "built-in"
     monkeypatch.setattr(type(entry), "third_party", lambda self: ["acme"])
-    assert probe.prepare([(store, [TUNING_SEEDS])], 3, "cpu") is None, "for tuning"
-    made = probe.prepare([(store, [0, 1, 2])], 3, "cpu")
+    assert probe.prepare([(store.entry(), store, [TUNING_SEEDS])], 3, "cpu") is None, "for tuning"
+    made = probe.prepare([(store.entry(), store, [0, 1, 2])], 3, "cpu")
     assert made is not None
-    assert probe.prepare([(store, [3])], 3, "cpu") is None, "it is claimed"
+    assert probe.prepare([(store.entry(), store, [3])], 3, "cpu") is None, "it is claimed"
     made.claim.release()
 
 

@@ -229,7 +229,7 @@ def test_a_worker_whose_seeds_were_taken_over_writes_nothing_more(
 ) -> None:
     """Asked before a line, a checkpoint and the end: what was written before stays, and no seed is finished."""
     held = iter(answers)
-    run = GroupRun(entry.entry(), entry, [0], epochs, held=lambda: next(held))
+    run = GroupRun([(entry.entry(), entry, [0])], epochs, held=lambda: next(held))
     with pytest.raises(StoreError, match="another worker has taken these seeds over"):
         run.run()
     assert len(entry.seed(0).epochs()) == 2

@@ -97,7 +97,7 @@ def stop(entry: Entry, store: EntryStore) -> None:
             raise KeyboardInterrupt
 
     try:
-        GroupRun(entry, store, SEEDS, EPOCHS, report=interrupt).run()
+        GroupRun([(entry, store, SEEDS)], EPOCHS, report=interrupt).run()
     except KeyboardInterrupt:
         return
     raise RuntimeError("the run was not interrupted")

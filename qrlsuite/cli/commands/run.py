@@ -23,6 +23,7 @@ from qrlsuite.cli.training import (
     TrackOption,
     WorkersOption,
 )
+from qrlsuite.engine.missing import summarize
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, resolve
@@ -112,7 +113,7 @@ def run(
     """
     where = where_of(engine, workers, device, fresh, same)
     written = _written(entry or [], model, settings or [], quick)
-    done = train_entry(
+    work, submitted = train_entry(
         resolve_entry(task, written, runs=runs),
         where,
         seeds or (QUICK_SEEDS if quick else None),
@@ -125,15 +126,15 @@ def run(
         start=start,
     )
     if json_output:
-        typer.echo(json.dumps({"submitted": done.submitted} if done.submitted else done.summary()))
-    elif done.submitted is not None:
-        typer.echo(done.submitted)
-    elif done.work.todo and done.work.entry.model.family == "quantum" and done.work.entry.start is None:
+        typer.echo(json.dumps({"submitted": submitted} if submitted else summarize(work)))
+    elif submitted is not None:
+        typer.echo(submitted)
+    elif work.todo and work.entry.model.family == "quantum" and work.entry.start is None:
         given = {"--seeds": seeds, "--epochs": epochs}
         words = [word for name, value in given.items() if value is not None for word in (name, str(value))]
         with contextlib.suppress(QrlSuiteError):  # a preset or an algorithm that is for circuits alone
             typer.echo(
-                _of_its_size(done.work.entry, task, written, [*words, *["--quick"] * quick], runs), err=True
+                _of_its_size(work.entry, task, written, [*words, *["--quick"] * quick], runs), err=True
             )
 
 

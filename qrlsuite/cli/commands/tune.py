@@ -25,6 +25,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.notation import write_setting
 from qrlsuite.results.survey import garbage
 from qrlsuite.results.text import counted, hours_text, size_text
+from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning.search import FOLDER, Search
 
 LARGE = 200
@@ -125,7 +126,7 @@ def tune(
     Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
     where = where_of(engine, workers, device, fresh, same)
-    tuning = plan_tuning(
+    searches, display, path = plan_tuning(
         task,
         entries,
         vary,
@@ -139,10 +140,9 @@ def tune(
         runs,
         progress=not json_output,
     )
-    searches = tuning.searches
     if not (dry_run or yes or budget):
         _require_few(searches)
-    complete = not dry_run and tuning.run()
+    complete = not dry_run and tuning_runner.run(searches, runs, where, display, path)
     if json_output:
         typer.echo(json.dumps({"searches": [each.as_dict() for each in searches], "complete": complete}))
     if json_output or dry_run:
