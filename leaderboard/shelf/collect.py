@@ -71,6 +71,14 @@ class Selection:
         """The results folder, and the folders of published entries."""
         return [self.runs, *(published_entries.folders() if self.published else ())]
 
+    @functools.cached_property
+    def stored(self) -> list[lookup.Stored]:
+        """Names and labels of the entries, of boards and of studies; read once for all names that are looked up."""
+        tasks = self.tasks
+        stores = _stores(self, of_studies=True)
+        found = lookup.stored(store for store in stores if not tasks or _task(store) in tasks)
+        return [entry for entry in found if not tasks or entry.task in tasks]
+
     @property
     def of_tasks(self) -> str:
         """Name the tasks: ` of task beam6g or cartpole`, empty for all."""
@@ -287,8 +295,7 @@ def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        everything = lookup.stored(_stores(selection, of_studies=True))
-        everything = [entry for entry in everything if not tasks or entry.task in tasks]
+        everything = selection.stored
         on_boards = {store.path for store in _stores(selection)}
         fitting = lookup.fitting(everything, name)
         # where entries of boards and of studies fit, those of boards are meant

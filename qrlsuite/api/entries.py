@@ -264,20 +264,17 @@ def compare(
     >>> found.verdict
     'mlp width=64 needs 53% fewer steps than mlp width=16 (50% to 56%, 100 seeds each, p < .0001)'
     """
+    selection = Selection.create(runs, task, published).named()
 
     def find(entry: str | EntryResults, beside: str | EntryResults) -> EntryResults:
         if isinstance(entry, EntryResults):
             return entry
         try:
-            return load(entry, task=task, runs=runs, published=published)
+            return collect.find(selection, entry)
         except UnknownNameError as error:  # it may be one of several, of which one is on the other's task
             try:
-                known = (
-                    beside
-                    if isinstance(beside, EntryResults)
-                    else load(beside, task=task, runs=runs, published=published)
-                )
-                return load(entry, task=known.task, runs=runs, published=published)
+                known = beside if isinstance(beside, EntryResults) else collect.find(selection, beside)
+                return collect.find(selection.of(known.task), entry)
             except UnknownNameError:
                 raise error from None
 
@@ -285,7 +282,7 @@ def compare(
     compared = compare_entries(left, other, rules.load(rule) if rule else None)
     if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared
-    others, left_out = collect.collect(Selection(Path(runs), published, (left.task,)))
+    others, left_out = collect.collect(selection.of(left.task))
     among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
     places = (f"of the same entry, from {left.folder}", f"of the same entry, from {other.folder}")
     copies = [f"left out: {line}" for line in left_out if line.endswith(places)]
