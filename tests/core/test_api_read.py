@@ -17,8 +17,12 @@ from rich.console import Console
 
 from qrlsuite import api
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError
-from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.experiment import identity
+from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.plugins.models import vqc
+from qrlsuite.results.store import EntryStore
+from qrlsuite.studies import study
 from tests.conftest import Train, cases
 from tests.leaderboard import boards
 
@@ -142,6 +146,43 @@ def test_html_holds_nothing_but_text(large: EntryResults) -> None:
         assert "<script" not in shown
         assert "<img" not in shown
         assert "&lt;script&gt;" in shown
+
+
+def calls(patch: pytest.MonkeyPatch, owner: Any, name: str) -> list[Any]:
+    """The first argument of each call of a function or method from now on."""
+    made, function = [], getattr(owner, name)
+
+    def counted(first: Any, *arguments: Any, **named: Any) -> Any:
+        made.append(first)
+        return function(first, *arguments, **named)
+
+    patch.setattr(owner, name, counted)
+    return made
+
+
+def test_work_is_done_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tiny_task: str, forked_workers: None
+) -> None:
+    """Entries are resolved once, tasks loaded once for all of them, names read once, and code looked at once."""
+    resolved, loaded = calls(monkeypatch, study, "resolve"), calls(monkeypatch, study, "load_task")
+    api.read_study("memory", runs=tmp_path)
+    assert (len(resolved), loaded) == (4, ["beam6g"])
+    published_studies.import_study(published_studies.PUBLISHED / "memory", tmp_path)
+    resolved.clear()
+    assert api.read_study("memory", runs=tmp_path).study.folder.is_relative_to(tmp_path), "it has begun there"
+    assert len(resolved) == 4
+    read = calls(monkeypatch, EntryStore, "record")
+    api.compare("mlp width=64", "mlp width=16", task="beam6g", **WHERE)
+    assert {store.path.parent.name for store in read} == {"beam6g"}
+    named = [path for at in published.folders() for path in (at / "beam6g").iterdir()]
+    on_board = len(list((published.PUBLISHED / "beam6g").iterdir()))
+    assert len(read) == len(named) + 2 + on_board, "names once; both entries, and the board with both"
+    identified, built = calls(monkeypatch, identity, "of"), calls(monkeypatch, vqc, "build_circuit")
+    options = {"qubits": 2, "layers": 1}
+    assert api.train(
+        tiny_task, "vqc-native", options=options, seeds=1, epochs=1, runs=tmp_path, progress=False
+    )
+    assert (len(identified), len(built)) == (1, 1)
 
 
 def test_names_and_entries_are_compared_alike(small: EntryResults, large: EntryResults) -> None:
