@@ -170,7 +170,7 @@ def train_entry(
     Returns
     -------
     tuple
-        What was missing when it began; and one line about what was handed to a queue, None where it was trained.
+        The missing seeds when it began; and one line about seeds handed to a queue, None if they were trained.
     """
     folder, quiet = Path(runs), not progress
     seed_numbers = None if seeds is None else read_seeds(seeds)
