@@ -7,7 +7,7 @@ episode terminated at s':
     loss = mean over the batch of (Q(s, a) - y)^2, summed over the S agents (so gradients do not mix)
 
 Per round, every environment takes one epsilon-greedy step, the transitions enter the replay buffer, and one
-Adam step is made on a batch drawn uniformly, with replacement, from what the buffer holds.
+Adam step is made on a batch drawn uniformly, with replacement, from the buffer.
 
 Deviations from the paper (section 'Experimental Setup' and its appendix):
 - The text's loss has online and target network swapped; this is the standard form, as in the released code.
@@ -189,7 +189,7 @@ class DDQN:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.online.load_state_dict(part(state, "online"))
         self.target.load_state_dict(part(state, "target"))
         self.adam.load_state_dict(part(state, "adam"))
@@ -199,7 +199,7 @@ class DDQN:
 
 
 def memory(options: DDQNOptions, rounds: int) -> Memory:
-    """Return what one agent keeps: online and target network, Adam's moments, the buffer; and an epoch's draws from it.
+    """Return one agent's memory: online and target network, Adam's moments, the buffer; and an epoch's draws from it.
 
     The buffer's rows have float32 numbers of observations of 4 numbers: beam6g's are 3, CartPole's 4.
     """

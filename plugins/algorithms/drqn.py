@@ -1,17 +1,17 @@
 """Deep recurrent Q-learning (Hausknecht & Stone 2015, arXiv:1507.06527) for a population of S seeds.
 
 Double Q-learning, as in `ddqn`, with networks that remember (`qrlsuite.population.remembers`). Online network Q and
-target network Q' see the observations o_1 .. o_t of an episode one by one; h_t is what Q remembers after o_t, h'_t what
-Q' does:
+target network Q' see the observations o_1 .. o_t of an episode one by one; h_t is Q's memory after o_t, h'_t the memory
+of Q':
 
     y_t  = r_t + g (1 - d_t) Q'(s'_t | h'_t, argmax_a Q(s'_t | h_t, a))    s'_t: where step t arrived, before any reset
     loss = mean over the batch's sequences and their last `length` steps of (Q(o_t | h_(t-1), a_t) - y_t)^2
 
-d_t = 1 where the episode terminated at s'_t; where a time limit truncated it, what would have followed is estimated
+d_t = 1 where the episode terminated at s'_t; where a time limit truncated it, the further return is estimated
 from s'_t like anywhere else. Losses are summed over the S agents, so that gradients do not mix. Per round, every
 environment takes one epsilon-greedy step and `updates` Adam steps are made, each on `batch` sequences of `burn_in` +
-`length` steps. They begin anywhere in what an environment did last, uniformly, and may run across ends of episodes:
-what is remembered becomes 0 where an episode begins.
+`length` steps. They begin anywhere in an environment's last steps, uniformly, and may run across ends of episodes:
+the memory becomes 0 where an episode begins.
 
 A sequence begins with nothing remembered, as in the paper's "bootstrapped random updates"; its first `burn_in` steps
 only fill the memory, without gradients (Kapturowski et al. 2019, "Recurrent Experience Replay in Distributed
@@ -20,7 +20,7 @@ Reinforcement Learning", section 3). The replay buffer holds no memories, so tha
 A model that does not remember is trained as by `ddqn`, on steps that are drawn in sequences.
 
 Deviations from the paper:
-- Double Q-learning, Adam, and a discount, batch and buffer like those of `ddqn`; the paper has Adadelta on Atari games.
+- Double Q-learning, Adam, and `ddqn`'s discount, batch and buffer; the paper has Adadelta on Atari games.
 - Burn-in is Kapturowski's; `burn_in = 0` is the paper's form.
 - Gradients are not clipped; the paper clips them at 10.
 - One gradient step per round of all environments; the paper has one for every fourth step of one environment.
@@ -115,7 +115,7 @@ class DRQN:
         return masks.masked(values, seen, self.obs_dim).argmax(2)
 
     def _nothing(self, batch: int) -> Tensor:
-        """Return what is remembered where episodes begin (S, batch, M)."""
+        """Return the memory at the begin of episodes, zeros (S, batch, M)."""
         return torch.zeros((self.S, batch, remembers(self.online)), device=self.device)
 
     def start(self) -> None:
@@ -231,7 +231,7 @@ class DRQN:
         begins:
             Where an episode begins with the observation (S, B).
         infos:
-            What the lanes said of it: nothing is chosen that they forbid.
+            The lanes' infos on it: forbidden actions are not chosen.
         """
         going_on = torch.from_numpy(~begins).to(self.device)[..., None]
         if self.validation.shape[1] != begins.shape[1]:  # other lanes than before: their episodes begin
@@ -246,7 +246,7 @@ class DRQN:
         return dict(self.online.state_dict())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return networks, optimizer, replay buffer, what is remembered of unfinished episodes, and counters."""
+        """Return networks, optimizer, replay buffer, the memory of unfinished episodes, and counters."""
         return {
             **prefixed(
                 online=self.online.state_dict(), target=self.target.state_dict(), adam=self.adam.state_dict()
@@ -259,7 +259,7 @@ class DRQN:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.online.load_state_dict(part(state, "online"))
         self.target.load_state_dict(part(state, "target"))
         self.adam.load_state_dict(part(state, "adam"))
@@ -272,9 +272,9 @@ class DRQN:
 
 
 def memory(options: DRQNOptions, rounds: int) -> Memory:
-    """Return what one agent keeps: online and target network, Adam's moments, the buffer, an epoch's draws.
+    """Return one agent's memory: online and target network, Adam's moments, the buffer, an epoch's draws.
 
-    A row is that of an observation of 4 numbers, as CartPole's.
+    A row is computed for observations of 4 numbers, as CartPole's.
     """
     draws = rounds * options.updates * options.batch
     steps = options.batch * (options.burn_in + options.length)

@@ -22,20 +22,20 @@ The actor's outputs are pi by the kind of the environment's actions:
   state: log pi(a|s) and entropy are sums over them;
 - box: the means of independent normals u with spreads e^l, l being A numbers beside the network that no state changes
   and Adam trains with it (`log_spread` at first; not counted as the model's parameters). An action is u clipped to
-  -1 .. 1, linear in the box (`qrlsuite.actions.from_units`); log pi is that of u, as in Stable-Baselines3.
+  -1 .. 1, linear in the box (`qrlsuite.actions.from_units`); log pi is computed from u, as in Stable-Baselines3.
 
-Rollouts run across the ends of episodes and are cut where the epoch ends; what would have followed is estimated by
-the critic, there and where a time limit truncated an episode, not where one terminated.
+Rollouts run across the ends of episodes and are cut where the epoch ends. The critic estimates the further return
+there, and where a time limit truncated an episode, but not where an episode terminated.
 
 *Models that remember* (`qrlsuite.population.remembers`) see an episode's observations one by one; pi and V depend on
-what they remember, too: s_t stands for both. The samples of a minibatch are then sequences of `length` consecutive
-steps of one environment, `batch` / `length` of them. A sequence begins with what was remembered there when it was
-collected, as in sb3-contrib's RecurrentPPO, and as the "stored state" of Kapturowski et al. (2019), who replay;
-gradients reach back to its first step. Where an episode begins, what is remembered becomes 0. Where `length` does not
+their memory, too: s_t stands for both. The samples of a minibatch are then sequences of `length` consecutive
+steps of one environment, `batch` / `length` of them. A sequence begins with the memory at its collection, as in
+sb3-contrib's RecurrentPPO, and as the "stored state" of Kapturowski et al. (2019), who replay; gradients reach back
+to its first step. Where an episode begins, the memory becomes 0. Where `length` does not
 divide T, some sequences overlap, so that all are equally long. RecurrentPPO cuts them at the ends of episodes and pads.
 
 With `repeats=1` and a `batch` of all samples, the ratio is 1 and nothing is clipped: one step per epoch along the
-gradient of - mean log pi(a|s) A, which is that of A2C (Mnih et al. 2016, arXiv:1602.01783, algorithm S3; Huang et al.
+gradient of - mean log pi(a|s) A, A2C's gradient (Mnih et al. 2016, arXiv:1602.01783, algorithm S3; Huang et al.
 2022, arXiv:2205.09123), with generalized, normalized advantages.
 
 Deviations from the paper (its algorithm 'Estimating the Sample Complexity of PPO' and its table of hyperparameters):
@@ -215,7 +215,7 @@ HALF_LOG_2_PI = 0.5 * float(np.log(2 * np.pi))
 
 
 def _total(parts: Sequence[Tensor]) -> Tensor:
-    """Add tensors, and leave a single one as it is."""
+    """Add tensors; a single tensor is returned unchanged."""
     total = parts[0]
     for each in parts[1:]:
         total = total + each
@@ -223,7 +223,7 @@ def _total(parts: Sequence[Tensor]) -> Tensor:
 
 
 class Rollout(NamedTuple):
-    """What an epoch of T rounds gave: N = T x E samples per seed, sample t * E + e being step t of environment e."""
+    """The samples of an epoch of T rounds: N = T x E per seed; sample t * E + e is step t of environment e."""
 
     states: Tensor
     """(S, N, obs)"""
@@ -236,7 +236,7 @@ class Rollout(NamedTuple):
     begins: Tensor
     """1 where an episode begins with the state (S, N)."""
     remembered: Tensor
-    """What the actor remembered before it saw the state (S, N, M)."""
+    """The actor's memory before it saw the state (S, N, M)."""
     rewards: FloatArray
     """(S, T, E), as the two below"""
     terminated: NDArray[np.bool_]
@@ -438,7 +438,7 @@ class PPO:
         )
 
     def _estimate(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
-        """Return A and R of the samples, both (S, N), and what the critic remembered before each (S, N, M)."""
+        """Return A and R of the samples, both (S, N), and the critic's memory before each (S, N, M)."""
         o, shape = self.options, rollout.rewards.shape
         rollout = rollout._replace(states=masks.observed(rollout.states, self.obs_dim))
         if remembers(self.critic):
@@ -503,8 +503,8 @@ class PPO:
         old_log_probs, advantages, returns:
             (S, B).
         memory:
-            Of models that remember: where episodes begin in each sequence (S, B / length, length), and what actor and
-            critic remembered before it, both (S, B / length, M).
+            For models that remember: begins of episodes in each sequence (S, B / length, length), and the memories of
+            actor and critic before it, both (S, B / length, M).
 
         Returns
         -------
@@ -546,7 +546,7 @@ class PPO:
         begins:
             Where an episode begins with the observation (S, B); None: everywhere.
         infos:
-            What the lanes said of it: nothing is chosen that they forbid.
+            The lanes' infos on it: forbidden actions are not chosen.
         """
         seen = torch.from_numpy(observations).to(self.device)
         if begins is None or self.validation_memory.shape[1] != seen.shape[1]:  # or other lanes than before
@@ -578,7 +578,7 @@ class PPO:
         return prefixed(**{prefix: self.policy.state_dict()}) if isinstance(self.policy, Gaussian) else {}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return networks, optimizers, current observations, what is remembered of them, and the epoch, seed-first."""
+        """Return networks, optimizers, current observations, the memories at them, and the epoch, seed-first."""
         remembered = {
             "begins": self.begins,
             "actor_memory": self.actor_memory,
@@ -603,7 +603,7 @@ class PPO:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.actor.load_state_dict(part(state, "actor"))
         self.critic.load_state_dict(part(state, "critic"))
         self.actor_adam.load_state_dict(part(state, "actor_adam"))
@@ -639,5 +639,5 @@ def _normalized(advantages: Tensor) -> Tensor:
 
 
 def memory(options: PPOOptions, rounds: int) -> Memory:
-    """Return what one agent keeps: actor and critic with Adam's moments of both."""
+    """Return one agent's memory: actor and critic with Adam's moments of both."""
     return Memory(networks=6, batch=min(options.batch, rounds))

@@ -13,20 +13,20 @@ gradient', its section 6.4 on CartPole) and gives no settings; the defaults are 
 
 How it meets a fixed number of steps per epoch:
 - An episode that is unfinished when the epoch ends carries over, and its steps are learned from in the epoch in which
-  it ends. Its actions stay as they were chosen, log pi(a|s) is evaluated under the parameters of the update: with
+  it ends. Its actions stay, while log pi(a|s) is evaluated under the parameters of the update: with
   episodes longer than an epoch, the earliest steps are off-policy by as many updates. No importance weights.
 - With `epochs_per_update` > 1 all environments begin anew after each update, and no episode carries over to the next:
   every step that is learned from was made by the policy that is updated. Episodes that are unfinished then are lost.
 - A seed without a completed episode makes no step: its parameters, moments and step count stay.
-- Of an unfinished episode the last `memory` steps are kept. Of a longer one the earliest are not learned from; the
-  reward-to-go of the others is exact, as it does not look back.
-- A time limit ends the reward-to-go like any other end, except with a value network, which then stands in for what
-  would have followed: r_t + g V(s') at a truncated step. Without one there is nothing to bootstrap from.
+- The last `memory` steps of an unfinished episode are stored. The earliest steps of a longer episode are not learned
+  from; the reward-to-go of later steps is exact, as it does not look back.
+- A time limit ends the reward-to-go like any other end, except with a value network, which then estimates the further
+  return: r_t + g V(s') at a truncated step.
 
-Steps lie in slots, (memory + rounds) per environment, and every slot goes through the networks in every epoch, those
-without a step to learn from with weight 0. All sums thus run over shapes that do not depend on the lengths of
-episodes, which is what makes each agent bitwise the agent it would have been alone. A model's count of circuit
-executions includes the empty slots, so `memory` should not be longer than episodes are.
+Steps lie in slots, (memory + rounds) per environment, and every slot goes through the networks in every epoch, with
+weight 0 if it has no step to learn from. All sums thus run over shapes that do not depend on the lengths of episodes,
+so that each agent is bitwise the agent of a separate training. A model's count of circuit executions includes the
+empty slots, so `memory` should not be longer than episodes are.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class REINFORCEOptions:
 def rewards_to_go(rewards: FloatArray, ended: BoolArray, gamma: float) -> tuple[FloatArray, BoolArray]:
     """Return the discounted reward-to-go of every step, and whether its episode has ended; (S, E, T) all.
 
-    The reward-to-go of a step whose episode has not ended is what has been collected so far.
+    The reward-to-go of a step in an unfinished episode is the sum so far.
     """
     later, complete = np.zeros(rewards.shape[:2]), np.zeros(rewards.shape[:2], dtype=np.bool_)
     returns, known = np.empty_like(rewards), np.empty_like(ended)
@@ -303,7 +303,7 @@ class Reinforce:
         return torch.stack([loss.detach(), value_loss.detach()]).to(torch.float64)
 
     def _carry(self, rows: Tensor, steps: NDArray[np.int64], known: BoolArray) -> None:
-        """Keep the last steps of unfinished episodes: those after the last end among the last `steps` slots."""
+        """Keep the last steps of unfinished episodes: the steps after the last end among the last `steps` slots."""
         memory = self.options.memory
         open_steps = np.minimum((~known).sum(2), steps)
         self.lengths = torch.from_numpy(np.minimum(open_steps, memory))
@@ -346,7 +346,7 @@ class Reinforce:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self.policy.load_state_dict(part(state, "policy"))
         self.adam.load_state_dict(part(state, "adam"))
         if self.value is not None and self.value_adam is not None:
@@ -361,5 +361,5 @@ class Reinforce:
 
 
 def memory(options: REINFORCEOptions, rounds: int) -> Memory:
-    """Return what one agent keeps: a policy, where the baseline is one a value network, and Adam's moments."""
+    """Return one agent's memory: a policy, a value network if it is the baseline, and Adam's moments."""
     return Memory(networks=6 if options.baseline == "value" else 3, batch=min(BLOCK, rounds))

@@ -13,7 +13,7 @@ transition (s, a, r, s', d), d = 1 where the episode terminated at s', the soft 
 
 every step in this order, losses summed over the S agents, so that gradients do not mix. Per round, every environment
 takes one step with an action drawn from pi, the transitions enter the replay buffer, and `updates` steps are made on
-batches drawn uniformly, with replacement, from what it holds. The first `warm_up` transitions of a seed come from
+batches drawn uniformly, with replacement, from the buffer. The first `warm_up` transitions of a seed come from
 uniform actions, and nothing is learned before.
 
 *Continuous actions.* The model's outputs are mean m and logarithm of the spread l of a normal u, l clipped to -20 .. 2,
@@ -28,9 +28,9 @@ as in the author's code; the text has no number. Validation takes the most proba
 
 Deviations from the papers:
 - The loss is linear in log alpha, not in alpha, as in the authors' code.
-- Batch 256, a learning rate of 3e-4, tau 0.005 and `warm_up` 100 are Stable-Baselines3's defaults, and but for the last
-  the paper's; Christodoulou has batch 64 and a gradient step every fourth interaction.
-- One gradient step per round of all environments; the papers have one environment, where that is the same.
+- Batch 256, a learning rate of 3e-4, tau 0.005 and `warm_up` 100 are Stable-Baselines3's defaults, and except for
+  `warm_up` the paper's; Christodoulou has batch 64 and a gradient step every fourth interaction.
+- One gradient step per round of all environments; the papers have one environment.
 - The replay buffer holds 50,000 transitions, not a million: it is part of every checkpoint.
 - Networks have the architecture of the entry's model; a critic is given s, and then a, in its first layer.
 """
@@ -65,7 +65,7 @@ LOG_SPREAD = (-20.0, 2.0)
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class SACOptions:
-    """Options of soft actor-critic; the defaults are those of Stable-Baselines3, the buffer aside."""
+    """Options of soft actor-critic; the defaults are Stable-Baselines3's, the buffer aside."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
     lr: Annotated[
@@ -99,7 +99,7 @@ class SACOptions:
 def log_probabilities(u: Tensor, noise: Tensor, log_spread: Tensor) -> Tensor:
     """Return log pi of tanh(u), u = m + noise e^l, all (S, B, A): (S, B).
 
-    Elementwise functions that torch computes alike in a vector's body and tail; softplus is none of them.
+    Only elementwise functions that torch computes alike in a vector's body and tail; softplus is not.
     """
     normal = -0.5 * noise.square() - log_spread - 0.5 * math.log(2.0 * math.pi)
     softplus = torch.relu(-2.0 * u) + torch.log1p(torch.exp(-2.0 * u.abs()))
@@ -233,7 +233,7 @@ class SAC:
         return outputs[..., : self.N], outputs[..., self.N :].clamp(*LOG_SPREAD)
 
     def _uniform(self, drawn: Tensor, step: int) -> Tensor:
-        """Return uniform actions as they were drawn, of discrete ones (S, E, 1) those among the free."""
+        """Return drawn uniform actions; discrete actions (S, E, 1) are drawn among the allowed ones."""
         if not self.discrete:
             return drawn
         seen, inputs = self.observations, self.obs_dim
@@ -362,7 +362,7 @@ class SAC:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         self._hold(state["observations"].clone().to(self.device))
         for name, each in self._parts().items():
             each.load_state_dict(part(state, name))
@@ -370,9 +370,9 @@ class SAC:
 
 
 def memory(options: SACOptions, rounds: int) -> Memory:
-    """Return what one agent keeps: three networks, the critics' copies, Adam's moments, the buffer, an epoch's draws.
+    """Return one agent's memory: three networks, the critics' copies, Adam's moments, the buffer, an epoch's draws.
 
-    A row is that of an observation of 3 numbers and an action of one, as Pendulum's.
+    A row is computed for an observation of 3 numbers and an action of one, as Pendulum's.
     """
     draws = rounds * options.updates * options.batch
     return Memory(networks=11, batch=options.batch, saved=options.buffer * 4 * 9, working=16 * draws)

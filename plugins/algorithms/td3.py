@@ -11,9 +11,9 @@ With actor mu, critics Q1 and Q2, slowly following copies mu', Q1' and Q2', disc
 
 Losses are summed over the S agents, so that gradients do not mix. Per round, every environment takes one step with
 clip(mu(s) + sigma n, -1, 1), the transitions enter the replay buffer, and `updates` steps are made on batches drawn
-uniformly, with replacement, from what it holds. With correlation rho, the noise of a step is sqrt(1 - rho^2) n + rho
-times that of the step before: an Ornstein-Uhlenbeck process as in DDPG (Lillicrap et al. 2015, arXiv:1509.02971), of
-the same spread, that begins anew in every epoch. The first `warm_up` transitions of a seed come from uniform actions,
+uniformly, with replacement, from the buffer. With correlation rho, the noise of a step is sqrt(1 - rho^2) n + rho
+times the noise of the step before: an Ornstein-Uhlenbeck process as in DDPG (Lillicrap et al. 2015, arXiv:1509.02971),
+of equal spread, that begins anew in every epoch. The first `warm_up` transitions of a seed come from uniform actions,
 and nothing is learned before.
 
 Actions are numbers in -1 .. 1, linear in the box of the environment's (`qrlsuite.actions.from_units`); mu is the
@@ -22,7 +22,7 @@ hyperbolic tangent of the model's outputs. A time limit that truncates an episod
 Deviations from the paper:
 - Batch 256 and one learning rate of 1e-3 for actor and critics are Stable-Baselines3's defaults; the paper has 100, and
   1e-3 for both. A `warm_up` of 100 transitions is Stable-Baselines3's, too; the paper has 1000 or 10,000.
-- One gradient step per round of all environments; the paper has one environment, where that is the same.
+- One gradient step per round of all environments; the paper has one environment.
 - The replay buffer holds 50,000 transitions, not a million: it is part of every checkpoint.
 - Networks have the architecture of the entry's model; a critic is given s, and then a, in its first layer.
 """
@@ -53,7 +53,7 @@ from qrlsuite.seeding import Streams
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class TD3Options:
-    """Options of TD3; the defaults are those of Stable-Baselines3, the buffer aside."""
+    """Options of TD3; the defaults are Stable-Baselines3's, the buffer aside."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
     lr: Annotated[
@@ -248,7 +248,7 @@ class TD3:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a result of `state_dict`."""
         for name, each in self._parts().items():
             each.load_state_dict(part(state, name))
         self.observations = state["observations"].clone().to(self.device)
@@ -256,9 +256,9 @@ class TD3:
 
 
 def memory(options: TD3Options, rounds: int) -> Memory:
-    """Return what one agent keeps: three networks, their copies and Adam's moments, the buffer, an epoch's draws.
+    """Return one agent's memory: three networks, their copies and Adam's moments, the buffer, an epoch's draws.
 
-    A row is that of an observation of 3 numbers and an action of one, as Pendulum's.
+    A row is computed for an observation of 3 numbers and an action of one, as Pendulum's.
     """
     draws = rounds * options.updates * options.batch
     return Memory(networks=12, batch=options.batch, saved=options.buffer * 4 * 9, working=12 * draws)

@@ -8,13 +8,13 @@ Rings are closed: qubit q is followed by (q + 1) mod n. On two qubits the ring o
 consists of both (0, 1) and (1, 0), as the definition says; on one qubit there is no neighbor: `cx` and `cz` then
 have no entangling gate, and `iqp`, all of whose gates are controlled, is refused.
 
-The option `entangled` takes the coupling of the qubits out, to see what it contributes: `separable` has no gate on two
+The option `entangled` takes the coupling of the qubits out, to see its contribution: `separable` has no gate on two
 qubits; `mean-field` has the same gates, and drops all correlations after every gate on two qubits
 (`Circuit.mean_field`). Separable circuits of the paper have the gate of qubit q on q, and H on every qubit between
 layers, the same for all three structures: without the H, neighboring RZ of `rot` would merge.
 
-The other ansaetze are those of other papers. Where a paper leaves the scale of its inputs to a function before the
-circuit, the scale is the model's here, too: its linear layer, or the task.
+The other ansatzes are from other papers. If a paper leaves the scale of its inputs to a function before the circuit,
+the scale is the model's here, too: its linear layer, or the task.
 """
 
 from __future__ import annotations
@@ -265,11 +265,11 @@ def wang(qubits: int, layers: int, options: WangOptions) -> Circuit:
     `coupling = "zz"` of ZZ rotations with trained angles (on two qubits a single gate). X of every qubit is measured:
     an H stands before each measurement of Z. `coupling = "ghz"` and "graph" are the circuits of an earlier version
     (`VQCBackbones2.py`), without the rings and the H: a GHZ state (H on qubit 0, and CNOTs from it to every other) or a
-    graph state (H on every qubit, a CZ for every edge) is prepared, and undone behind the layers. Separable is the same
-    circuit without the rings or the state, as the authors have it. All parameters start uniform in [0, 1).
+    graph state (H on every qubit, a CZ for every edge) is prepared, and undone behind the layers. Separable is the
+    circuit without the rings or the state, as in the authors' code. All parameters start uniform in [0, 1).
 
-    Of the paper the abstract was read, and of its code not the last version: that X is measured is told by the names of
-    its runs (`XObs`), and where the angles of ZZ start is a guess. Their inputs are multiplied by 2 pi:
+    Only the paper's abstract was read, and an earlier version of its code: that X is measured follows from the names of
+    its runs (`XObs`), and the first angles of ZZ are a guess. Their inputs are multiplied by 2 pi:
     `init_scale=6.283185307`. Their GHZ state begins at qubit 1 of 8, and they measured three qubits then.
     """
     circuit = _begun(qubits, options.entangled)

@@ -332,7 +332,7 @@ def _device(options: PennyLaneOptions, qubits: int, seed: int | None) -> Any:
 
 
 def _on_braket(options: PennyLaneOptions) -> bool:
-    """Return whether the device is one of Amazon's, of which simulators cost money, too."""
+    """Return whether the device is Amazon's, where simulators cost money, too."""
     return options.device.startswith("arn:")
 
 

@@ -53,7 +53,7 @@ PATIENCE = 60.0
 """Seconds for which workers that were asked to stop are waited for."""
 
 PASSED_ON = ("QRLSUITE_", "PYTHONPATH", "NUMBA_")
-"""Beginnings of the environment variables that a worker on another machine needs as they are here."""
+"""Beginnings of the names of environment variables that a worker on another machine needs."""
 
 
 def _template(text: str) -> str:
@@ -154,7 +154,7 @@ class _CommandJob(WorkerJob):
         Parameters
         ----------
         place:
-            From 1: what `{i}` stands for.
+            The number of the worker, from 1: the value of `{i}`.
         """
         self.place, self.begun, self._before = place, False, self.progress.read()
         own = {name: value for name, value in os.environ.items() if name.startswith(PASSED_ON)}
@@ -192,7 +192,7 @@ class _CommandJob(WorkerJob):
         return claimed or waits
 
     def ended(self, outcome: EngineOutcome) -> bool:
-        """Judge what has ended; returns whether to start it again, else enters what became of it in the outcome."""
+        """Judge an ended worker; return whether to start it again, else record its end in the outcome."""
         text, progress = self.take_output(), self.progress.read()
         code = 0 if self.process is None else self.process.returncode
         if self.finished():

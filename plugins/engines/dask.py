@@ -46,7 +46,7 @@ LOOK_SECONDS = 1.0
 """Seconds between two looks at which workers there are, where nothing is sent."""
 
 SEND_SECONDS = 0.1
-"""The same where something is: a worker that has just come is known before it gets a task."""
+"""Shorter if there are tasks to send: a new worker is registered before it gets a task."""
 
 POLL_SECONDS = 0.1
 """Seconds between two looks at whether an answer has come."""
@@ -55,7 +55,7 @@ FETCH_SECONDS = 5.0
 """For which an answer is fetched; one whose worker has died meanwhile is worked on again first."""
 
 PATIENCE = 15.0
-"""Seconds without any worker after which that is said."""
+"""Seconds without any worker before a message says so."""
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -89,7 +89,7 @@ class DaskEngine:
         return set()
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
-        """Send the groups of each work as tasks, and write what is answered."""
+        """Send the groups of each work as tasks, and write the answers."""
         return train_remotely(self, works, show)
 
     def connect(self, workers: int, versions: Mapping[str, str | None]) -> DaskLink:

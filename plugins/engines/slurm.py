@@ -199,7 +199,7 @@ class SlurmEngine:
 
 
 def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[SeedGroup], epochs: int) -> None:
-    """Add tasks to `submitted.json`, and forget those that SLURM no longer knows."""
+    """Add tasks to `submitted.json`, and forget tasks that SLURM no longer knows."""
     try:
         waiting = _waiting()
     except QrlSuiteError:

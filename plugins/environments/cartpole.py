@@ -1,6 +1,6 @@
 """CartPole-v1 for populations: all lanes in one computation, each lane the one that Gymnasium would give.
 
-The equations are those of Gymnasium's `CartPoleEnv` in the same order of operations, in float64, so states,
+The equations are from Gymnasium's `CartPoleEnv` in the same order of operations, in float64, so states,
 rewards and ends agree with it to the last bit, in every lane and whatever the number of lanes.
 """
 
@@ -62,7 +62,7 @@ class CartPoleOptions:
 
 
 def _normalization(options: CartPoleOptions) -> Normalization:
-    """Return the map from raw observations (..., 4) to those of `options`."""
+    """Return the map from raw observations (..., 4) to observations by `options`."""
     high = np.array([2 * X_LIMIT, np.inf, 2 * THETA_LIMIT, np.inf], dtype=np.float32)
     low = high_given = None
     if options.normalization == "bounds":
@@ -97,9 +97,9 @@ class CartPole(CartPoleEnv):
 
     With `normalization = "arctan"` each value is replaced by its arcus tangens, in (-pi/2, pi/2), as in Skolik,
     Jerbi and Dunjko, "Quantum agents in the Gym" (2022). With `"bounds"` each is divided by its bound; the
-    default bounds are those of Jerbi et al., "Parametrized quantum policies for reinforcement learning" (2021).
+    default bounds are from Jerbi et al., "Parametrized quantum policies for reinforcement learning" (2021).
     With `"running"`, in tasks only, the environment leaves them and each agent standardizes them by the mean and
-    variance of what it has trained on (`qrlsuite.training.standardization`).
+    variance of its training observations (`qrlsuite.training.standardization`).
 
     ## Rewards
 

@@ -67,7 +67,7 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     ## Description
 
-    A contextual bandit: actions do not change what comes next. The optimal policy is a circuit's by construction.
+    A contextual bandit: actions do not change later observations. The optimal policy is a circuit's by construction.
 
     ## Action Space
 
@@ -97,7 +97,7 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
     """
 
     points: NDArray[np.float32]
-    """(steps, 2): what is shown in this episode."""
+    """(steps, 2): the observations of this episode."""
     classes: NDArray[np.int64]
     """(steps,): the right answers."""
     metadata = {"render_modes": []}

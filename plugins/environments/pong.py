@@ -27,7 +27,7 @@ PADDLE_SPEED, BALL_SPEED, BALL_MOST, BALL_MORE = 8.0, 10.0, 13.0, 3.0
 LOWEST, HIGHEST = -PADDLE / 2, HEIGHT - PADDLE / 2
 """Between these is the lower end of a paddle."""
 STEPS = np.array([0.0, 1.0, -1.0])
-"""What the actions do: stay, up, down."""
+"""Movements of the actions: stay, up, down."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -59,7 +59,7 @@ class Pong(OneLane):
     middle. The opponent follows the ball as fast as a paddle moves, 8 pixels a frame: it misses only a ball that is
     steeper. A ball becomes steeper, by 3 pixels a frame, when the agent's paddle moves as it hits.
 
-    Rules and sizes are those of PufferLib's Pong (`ocean/pong/pong.h`; in its settings, `frames` is 8 and `points` 21).
+    Rules and sizes are from PufferLib's Pong (`ocean/pong/pong.h`; in its settings, `frames` is 8 and `points` 21).
     Three things are ours: `serve`, because a game from two serves can be learned by heart; the time limit; and that the
     agent sees points and the new serve at once. There, points are divided as integers and seen as 0, and right after a
     point the observation is the one before it. The code is ours.
@@ -219,7 +219,7 @@ class PongLanes(EpisodeLanes):
         return scores
 
     def _possible(self, state: Mapping[str, NDArray[Any]]) -> bool:
-        """Refuse what no game comes to."""
+        """Refuse states that no game reaches."""
         most, ball = self.options.points, np.abs(state["ball"])
         points, paddles, serves = state["points"], state["paddles"], state["serves"]
         possible = (

@@ -51,8 +51,8 @@ class Room(OneLane):
     ## Description
 
     Agent and goal stand on different cells of a square room, everywhere equally likely, and the agent is turned in any
-    of four directions. It sees an image. What it sees by itself (`view = "own"`) is a part of the room: where the goal
-    is not in sight, it has to look around. Source of the idea: Chevalier-Boisvert et al., "Minigrid & Miniworld"
+    of four directions. It sees an image. Its own view (`view = "own"`) is a part of the room: if the goal is not in
+    sight, it has to look around. Source of the idea: Chevalier-Boisvert et al., "Minigrid & Miniworld"
     (2023), `MiniGrid-Empty-Random`; code and sizes are ours.
 
     ## Action Space
@@ -75,7 +75,7 @@ class Room(OneLane):
     ## Episode End
 
     The episode is *terminated* at the goal and *truncated* after `steps` steps. `info["score"]` is then the return over
-    that of the shortest way, in [0, 1].
+    the shortest way's return, in [0, 1].
 
     ## Arguments
 
@@ -83,7 +83,7 @@ class Room(OneLane):
     |----------|---------|---------------------------------------------|
     | `size`   | 8       | side of the room, walls included            |
     | `view`   | "own"   | "own" or "whole"                            |
-    | `sight`  | 5       | side of what is seen by itself, odd         |
+    | `sight`  | 5       | side of its own view, odd                   |
     | `steps`  | 100     | time limit                                  |
 
     ## Version History
@@ -106,7 +106,7 @@ class Room(OneLane):
         super().__init__(RoomLanes(option_words.build(RoomOptions, values, "environment 'room'"), 1))
 
     def render(self) -> Any:
-        """Return the room from above, (height, width, 3) uint8, with what the agent sees brighter."""
+        """Return the room from above, (height, width, 3) uint8, with the agent's view brighter."""
         assert isinstance(self.lanes, RoomLanes)
         return self.lanes.picture()
 
@@ -157,11 +157,11 @@ class RoomLanes(EpisodeLanes):
         return found
 
     def _rewards(self) -> NDArray[np.float64]:
-        """Return what agents get where they stand, (L,)."""
+        """Return the reward of each agent's place, (L,)."""
         return np.where(self._found(), 1.0 - 0.9 * self.step_count / self.options.steps, 0.0)
 
     def _scores(self) -> NDArray[np.float64]:
-        """Return the reward over that of the shortest way."""
+        """Return the reward over the shortest way's reward."""
         steps = self.options.steps
         scores: NDArray[np.float64] = self._rewards() / (1.0 - 0.9 * np.minimum(self._best, steps) / steps)
         return scores
@@ -232,7 +232,7 @@ class RoomLanes(EpisodeLanes):
         return x + forward * dx - side * dy, y + forward * dy + side * dx
 
     def _seen(self) -> NDArray[np.float32]:
-        """Return what every lane sees (L, n), a new array."""
+        """Return every lane's observation (L, n), a new array."""
         assert self.unflattened_space is not None
         seen = np.zeros((self.num_envs, *(self.unflattened_space.shape or ())), np.float32)
         size = self.options.size

@@ -3,9 +3,9 @@
 The architecture of Mnih et al. (2015, Nature 518, 529) made small: theirs has three convolutions and a hidden layer of
 512 units. Images are (height, width), (height, width, channels), or (channels, height, width) where the first side is
 shorter than the last. Their values are mapped from the space's bounds to 0 .. 1, bytes thus divided by 255; without
-bounds they stay as they are. What a critic is given beside the image, an action, joins the hidden layer's inputs.
+bounds they are not changed. A critic's action, given beside the image, joins the hidden layer's inputs.
 
-Initial values are those of `torch.nn.Conv2d` and `torch.nn.Linear`: uniform(-1/sqrt(n), 1/sqrt(n)), n being the inputs
+Initial values are as in `torch.nn.Conv2d` and `torch.nn.Linear`: uniform(-1/sqrt(n), 1/sqrt(n)), n being the inputs
 of a unit. A population's convolutions are exact in any stack (`qrlsuite.population.stack`).
 """
 

@@ -125,8 +125,8 @@ def initial_layer(
 ) -> tuple[Tensor, Tensor]:
     """Draw a layer's weight (fan_out, fan_in) and bias (fan_out,).
 
-    `torch` is what `torch.nn.Linear` does, `he` is of He et al. (2015), `siren` of Sitzmann et al. (2020, section 3.2;
-    the factor that they put on the input is an option of its own here), where the `first` layer is another one.
+    `torch` is `torch.nn.Linear`'s initialization, `he` He et al.'s (2015), `siren` Sitzmann et al.'s (2020, section
+    3.2; their factor on the input is an option of its own here), which treats the `first` layer differently.
     """
     bound = 1.0 / math.sqrt(fan_in)
     if init == "he":

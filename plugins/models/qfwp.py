@@ -2,11 +2,11 @@
 arXiv:2402.17760): a classical network writes into a circuit's angles, which remember.
 
 With observation x, a state F that is 0 where an episode begins, and E the expectation values <Z_q> of a circuit with
-parameters w beside those that scale inputs, L rows of P numbers (layers, and what a layer has):
+parameters w beside its scales of inputs, L rows of P numbers (layers, and numbers of a layer):
 
     a  = A x + a0                         L numbers   the slow programmer
     p  = B x + b0                         P numbers
-    F' = F + a p^T                        what was shown is added, and nothing is overwritten
+    F' = F + a p^T                        the observation is added, and nothing is overwritten
     y  = V E(W x + b; w + F') + u         w is trained
 
 The state is L P numbers. With `linear = false` there are no W and V: inputs are x, and y_j = u_j E_j.
@@ -36,10 +36,10 @@ from qrlsuite.population import linear
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class QFWPOptions(QLSTMOptions):
-    """Options of quantum fast weights: those of `qlstm`."""
+    """Options of quantum fast weights, as of `qlstm`."""
 
     def check(self) -> None:
-        """Refuse a circuit without angles to write into, and what `vqc` refuses."""
+        """Refuse a circuit without angles to write into, and circuits that `vqc` refuses."""
         super().check()
         _written(self._circuit)
 

@@ -3,7 +3,7 @@
 With observation x, a state of h and m that is 0 where an episode begins, s(a) = (1 + tanh(a / 2)) / 2, and E_k the
 expectation values <Z_q> of four circuits of one ansatz, each with parameters of its own:
 
-    v  = W [x; h] + b                     what all four circuits are given
+    v  = W [x; h] + b                     the input of all four circuits
     i  = s(E_i(v))                        how much is added to m
     f  = s(E_f(v))                        how much of m is kept
     g  = tanh(E_g(v))
@@ -15,7 +15,7 @@ expectation values <Z_q> of four circuits of one ansatz, each with parameters of
 On n qubits h and m are n numbers each. With `linear = false` there is no W, as in the paper: v = [x; h], h and m have
 as many numbers as the circuit has inputs beyond x, gates are the first expectation values, and y_j = u_j h'_j.
 
-An expectation value lies in -1 .. 1, so f lies in .27 .. .73, as in the paper: what m holds decays by a quarter per
+An expectation value lies in -1 .. 1, so f lies in .27 .. .73, as in the paper: the content of m decays by a quarter per
 step at least, and 20 steps leave .002 of it.
 
 Deviations from the paper, in which an ansatz is a matter of choice, too:
@@ -49,7 +49,7 @@ GATES = 4
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class QLSTMOptions(VQCOptions):
-    """Options of every quantum LSTM: those of `vqc`, with other defaults."""
+    """Options of every quantum LSTM, as of `vqc`, with other defaults."""
 
     qubits: Annotated[int, Field(ge=1, le=20, description="qubits of each circuit, and numbers of h")] = 4
     layers: Annotated[int, Field(ge=1, le=256, description="layers of each circuit")] = 2
@@ -62,7 +62,7 @@ class QLSTMOptions(VQCOptions):
 
 
 class Remembering(vqc._Hybrid):
-    """What networks with circuits that remember have in common, of one agent or of S.
+    """The common part of networks with circuits that remember, of one agent or of S.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ class Remembering(vqc._Hybrid):
     remembers:
         How many numbers an agent remembers.
     alone:
-        Whether this is one agent's: (B, in) and a state (B, remembers) to outputs (B, out) and the next state; else all
-        of these have a leading axis S.
+        Whether this is one agent's: (B, in) and a state (B, remembers) to outputs (B, out) and the next state; if not,
+        all have a leading axis S.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Remembering(vqc._Hybrid):
         self.remembers, self._alone = remembers, alone
 
     def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
-        """Return outputs and the next state; without a state those outputs alone that an episode begins with."""
+        """Return outputs and the next state; without a state, an episode's first outputs alone."""
         seen = x[None] if self._alone else x
         own = {name: p[None] if self._alone else p for name, p in self.named_parameters()}
         before = seen.new_zeros((*seen.shape[:2], self.remembers))
@@ -96,7 +96,7 @@ class Remembering(vqc._Hybrid):
         raise NotImplementedError
 
     def circuit_states(self, x: Tensor) -> Tensor:
-        """Refuse: they depend on what is remembered, too."""
+        """Refuse: the states depend on the memory, too."""
         raise OptionError("the states of circuits that remember are not known by observations alone")
 
     def measured(
@@ -161,5 +161,5 @@ def population(modules: Sequence[Any], options: VQCOptions) -> nn.Module:
 
 
 def memory(options: QLSTMOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of the states that a simulator keeps, 0 where nothing is known of it."""
+    """Return the bytes of circuit states in memory; 0 if unknown."""
     return vqc.memory(options, GATES * agents, batch, copies)

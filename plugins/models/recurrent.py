@@ -21,7 +21,7 @@ and m, `width` numbers each,
     y  = V h' + v
 
 The cells are written out, and s by the hyperbolic tangent: torch rounds its own sigmoid differently in the body and in
-the tail of a vector, and a seed would depend on the seeds that are trained with it. Initial values are those of
+the tail of a vector, and a seed would depend on the seeds that are trained with it. Initial values are as in
 `torch.nn.GRU`, `torch.nn.LSTM` and `torch.nn.Linear`: uniform(-1/sqrt(n), 1/sqrt(n)), n being the width. As there, a
 sum of two biases stands for every b.
 """
@@ -60,7 +60,7 @@ def gate(x: Tensor) -> Tensor:
 
 
 def lstm_step(parts: Tensor, before: Tensor) -> Tensor:
-    """Return h' and m' (..., 2 width) by what i, f, g and o are functions of (..., 4 width), and by h and m."""
+    """Return h' and m' (..., 2 width) from the arguments of i, f, g and o (..., 4 width), and from h and m."""
     i, f, g, o = torch.chunk(parts, 4, -1)
     kept = gate(f) * before[..., before.shape[-1] // 2 :] + gate(i) * torch.tanh(g)
     return torch.cat([gate(o) * torch.tanh(kept), kept], -1)
@@ -89,12 +89,12 @@ class _Unit(nn.Module):
                 parameter.copy_((torch.rand(parameter.shape, generator=generator) * 2.0 - 1.0) * bound)
 
     def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
-        """Return outputs and the next state; without a state those outputs alone that an episode begins with."""
+        """Return outputs and the next state; without a state, an episode's first outputs alone."""
         return self.compute(lambda name, inner: self.get_submodule(name)(inner), x, state, self.options)
 
     @classmethod
     def compute(cls, layer: Layer, x: Tensor, state: Tensor | None, options: RecurrentOptions) -> Any:
-        """Return what `forward` does, of one agent or of S, by their layers."""
+        """Return the result of `forward`, of one agent or of S, by their layers."""
         width = options.width
         before = x.new_zeros((*x.shape[:-1], cls.states * width)) if state is None else state
         after = cls.step(
@@ -105,7 +105,7 @@ class _Unit(nn.Module):
 
     @classmethod
     def step(cls, seen: Tensor, shown: Tensor, before: Tensor) -> Tensor:
-        """Return the next state, in which h comes first, by what the layers make of x and of h."""
+        """Return the next state, h first, from the layers' outputs for x and for h."""
         raise NotImplementedError
 
 

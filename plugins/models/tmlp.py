@@ -146,5 +146,5 @@ def population(modules: Sequence[TMLP], options: TMLPOptions) -> TMLPPopulation:
 
 
 def memory(options: TMLPOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of the contracted weights of hidden layers, and of what is kept to differentiate them."""
+    """Return the bytes of the contracted weights of hidden layers, with the data to differentiate them."""
     return 4 * agents * (options.depth - 1) * options.width**2 * copies * 3

@@ -12,14 +12,13 @@ the product of all as in Jerbi et al. (2021). `output_reuse` and `output_scale` 
 OutputScale of SimplyQRL (Lazaro, Vazquez & Bringas 2025, arXiv:2511.17112; scales begin at 2 there). Repeated values
 before a linear layer add no function: each weight becomes a sum of several, with other initial values and steps.
 
-What an algorithm asks for, logits, values, means and logarithms of spreads, are outputs like any other. Expectation
-values lie in -1 .. 1, and what is behind the circuit takes them elsewhere. Means are in halves of an action's range,
-or pass through a hyperbolic tangent, so they are needed there. Values may be hundreds, and Adam moves a weight by its
-learning rate per step: in 20,000 steps of 0.001 four qubits and a bias come to 100 at most. `output_rate` is a factor
-on the learning rate of what is behind the circuit; Skolik et al. have 0.1 there, for Q-values, beside 0.001: a factor
-of 100. `critic = "mlp"` takes a perceptron for what estimates values, as Lan (2021, "Variational quantum soft
-actor-critic", arXiv:2112.11921), whose policy alone is hybrid: also where a critic is given (s, a), which the circuit
-may not fit.
+Logits, values, means and logarithms of spreads are outputs like any other. Expectation values lie in -1 .. 1, and the
+layer behind the circuit maps them to other ranges. Means are in halves of an action's range, or pass through a
+hyperbolic tangent, so they are needed there. Values may be hundreds, and Adam moves a weight by its learning rate per
+step: in 20,000 steps of 0.001 four qubits and a bias reach 100 at most. `output_rate` is a factor on the learning rate
+of the layer behind the circuit; Skolik et al. have 0.1 there, for Q-values, beside 0.001: a factor of 100.
+`critic = "mlp"` takes a perceptron for networks of values, as Lan (2021, "Variational quantum soft actor-critic",
+arXiv:2112.11921), whose policy alone is hybrid; also for a critic of (s, a), which the circuit may not fit.
 
 One module serves all backends; the models differ in which backend computes the circuit.
 """
@@ -61,7 +60,7 @@ OptionValue = bool | int | float | str
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class VQCOptions:
-    """Options of every hybrid circuit model; `VQCOptions["native"]` are those of `vqc-native`, with its backend's."""
+    """Options of every hybrid circuit model; `VQCOptions["native"]` has the options of `vqc-native` and its backend."""
 
     backend: ClassVar[str]
     passes_on: ClassVar[tuple[str, ...]] = ("gate",)
@@ -162,7 +161,7 @@ class VQCOptions:
     @field_validator("ansatz_options")
     @classmethod
     def _ansatz_options(cls, values: dict[str, OptionValue], info: ValidationInfo) -> dict[str, OptionValue]:
-        """Leave out what the hash does not cover, see `qrlsuite.options.Since`."""
+        """Leave out options that the hash does not cover, see `qrlsuite.options.Since`."""
         try:
             return (
                 without_later(
@@ -182,7 +181,7 @@ class VQCOptions:
 
     @functools.cached_property
     def _circuit(self) -> Circuit:
-        """The circuit, shared by all that is built of these options."""
+        """The circuit, shared by all models with these options."""
         return build_circuit(self)
 
     def check(self) -> None:
@@ -207,7 +206,7 @@ class VQCOptions:
 
 
 class _Runner:
-    """A circuit, its backend and its counter: what the deep copies of a model share."""
+    """A circuit, its backend and its counter, shared by deep copies of a model."""
 
     def __init__(self, options: VQCOptions) -> None:
         self.options = options
@@ -262,7 +261,7 @@ class _Factors(nn.Module):
 
 
 class _Hybrid(nn.Module):
-    """What one agent's module and a population have in common; parameters `input.*, circuit.*, output.*`."""
+    """The common part of one agent's module and a population; parameters `input.*, circuit.*, output.*`."""
 
     shot_key: Tensor
     shot_count: Tensor
@@ -305,12 +304,12 @@ class _Hybrid(nn.Module):
         return bool(getattr(self._runner.backend, "simulator", True))
 
     def terms(self, circuits: int) -> str:
-        """Say what waits at the circuit's device, and what a number of circuits costs; nothing for a simulator."""
+        """Return the queue at the circuit's device and the price of a number of circuits; empty for a simulator."""
         said = getattr(self._runner.backend, "terms", None)
         return "" if said is None else said(circuits)
 
     def compile_circuits(self) -> None:
-        """Let the circuit's backend compile what the first pass would, if it has a way to."""
+        """Let the circuit's backend compile the code of the first pass, if it can."""
         compile_for = getattr(self._runner.backend, "compile_for", None)
         if compile_for is not None and self.simulator:
             compile_for(next(self.output.parameters()))
@@ -325,7 +324,7 @@ class _Hybrid(nn.Module):
         return dense.states(self._runner.circuit, inner, torch.cat(parameters, dim=1))
 
     def _circuit_inputs(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
-        """Map (S, B, in) to what the circuit is given, (S, B, circuit.inputs)."""
+        """Map (S, B, in) to the circuit's inputs, (S, B, circuit.inputs)."""
         inner = x.to(state["output.weight"].dtype)
         if self._runner.options.linear is True:
             inner = linear(inner, state["input.weight"], state["input.bias"])
@@ -338,7 +337,7 @@ class _Hybrid(nn.Module):
         return {f"circuit.{name}" for name in self._runner.circuit.parameters}
 
     def learning_rates(self) -> dict[str, float]:
-        """Return the factor on the learning rate of what is behind the circuit."""
+        """Return the factor on the learning rate of the layer behind the circuit."""
         rate = self._runner.options.output_rate
         return {} if rate == 1.0 else {f"output.{name}": rate for name, _ in self.output.named_parameters()}
 
@@ -355,7 +354,7 @@ class _Hybrid(nn.Module):
         return self._shown(ACTIVATIONS[options.activation_out](values), state).to(x.dtype)
 
     def _shown(self, values: Tensor, state: dict[str, Tensor]) -> Tensor:
-        """Return outputs (S, B, out) by what is behind the circuit."""
+        """Return outputs (S, B, out) of the layer behind the circuit."""
         options = self._runner.options
         if options.output_reuse > 1:
             values = values.repeat(1, 1, options.output_reuse)
@@ -535,14 +534,14 @@ def population(modules: Sequence[VQC | mlp.MLP], options: VQCOptions) -> VQCPopu
 
 
 def memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of the states that a simulator keeps, 0 where nothing is known of it."""
+    """Return the bytes of circuit states in memory; 0 if unknown."""
     if options.backend == "native":
         return _native_memory(options, agents, batch, copies)
     return _pennylane_memory(options, agents, batch, copies) if options.backend == "pennylane" else 0
 
 
 def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of 2^n complex amplitudes, 8 each (16 in float64), of every sample, where they are kept.
+    """Return the bytes of 2^n complex amplitudes, 8 each (16 in float64), of every sample, if they stay in memory.
 
     Three of the simulator's working states, of 128 bytes per amplitude, come on top.
     """

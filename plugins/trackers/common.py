@@ -1,4 +1,4 @@
-"""What all built-in trackers do alike: the names of the metrics, the settings of a run, and what one run is."""
+"""Common parts of all built-in trackers: names of metrics, settings of a run, and the identity of a run."""
 
 from __future__ import annotations
 

@@ -5,10 +5,10 @@
 
 All runs of a results folder are in its `mlflow.db`, each task an experiment; with `--track mlflow=DIR`, in
 `DIR/mlflow.db`; with `--track mlflow=http://...` or the environment variable `MLFLOW_TRACKING_URI`, on that server.
-Steps are epochs, and the names of the metrics are those of TensorBoard.
+Steps are epochs, and metrics have their names in TensorBoard.
 
-A resumed run is the same MLflow run. Epochs that it holds already, which come again after a kill, are left out, and
-those that it lacks are added from the run's own records: it has every epoch once.
+A resumed run is the same MLflow run. Epochs that come again after a kill are left out, and missing epochs are added
+from the run's own records: it has every epoch once.
 """
 
 from __future__ import annotations

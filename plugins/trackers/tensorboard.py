@@ -5,10 +5,10 @@
 
 Event files lie in `tensorboard/` in each seed's folder; with `--track tensorboard=DIR`, in
 `DIR/<task>/<entry>/seed-0007`. Scalars by epoch: `validation/score` is the mean over the validation episodes,
-`training/return`, `training/score`, `training/loss` and the algorithm's other metrics are those of `epochs.jsonl`.
+`training/return`, `training/score`, `training/loss` and the algorithm's other metrics are from `epochs.jsonl`.
 
-A resumed run repeats the epochs after its checkpoint. Its new event file says where it goes on, and readers drop
-what earlier files have from there (TensorBoard's session start), so every epoch is shown once. Files are opened for
+A resumed run repeats the epochs after its checkpoint. Its new event file names its first epoch, and readers drop
+later epochs of earlier files (TensorBoard's session start), so every epoch is shown once. Files are opened for
 each epoch alone: a worker trains a hundred seeds, and TensorBoard's own writer would keep a thread for each.
 """
 

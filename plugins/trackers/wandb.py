@@ -4,9 +4,8 @@
     wandb sync runs/*/*/seed-*/wandb
 
 Runs are offline unless the environment variable `WANDB_MODE` says `online`. Their files lie in `wandb/` in each seed's
-folder; with `--track wandb=DIR`, in `DIR/<task>/<entry>/seed-0007/wandb`. Steps are epochs, and the names of the
-metrics are those of TensorBoard. `WANDB_PROJECT` (by default `qrlsuite`) and `WANDB_ENTITY` say where runs are synced
-to.
+folder; with `--track wandb=DIR`, in `DIR/<task>/<entry>/seed-0007/wandb`. Steps are epochs, and metrics have their
+names in TensorBoard. `WANDB_PROJECT` (by default `qrlsuite`) and `WANDB_ENTITY` are the target of a sync.
 
 A resumed run is the same W&B run. Offline, W&B writes a new folder when it goes on, and a kill loses what its service
 had not written yet. The new folder therefore begins with all earlier epochs, from the run's own records, and takes the

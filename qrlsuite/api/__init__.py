@@ -16,8 +16,8 @@
     api.run_study("width.toml")
 
 Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
-those of `qrlsuite.errors`; where a message names an option of a command, such as `--task`, the function's argument has
-the same name.
+from `qrlsuite.errors`; if a message names an option of a command, such as `--task`, the function's argument has that
+name.
 """
 
 from __future__ import annotations

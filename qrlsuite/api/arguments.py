@@ -25,7 +25,7 @@ def where_of(
 
 
 def check_positive(name: str, value: int | None) -> None:
-    """Refuse what is no whole number, 1 or more; None passes."""
+    """Refuse all but whole numbers, 1 or more, and None."""
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise OptionError(f"{name} = {value!r}: give a whole number, 1 or more")
 

@@ -326,13 +326,13 @@ def diagnose_ansatz(
 ) -> CircuitDiagnosis:
     """Diagnose a circuit over its size: gradients, Fisher information, frequencies, states, Lie algebra.
 
-    Parameters are drawn as they are initially, inputs from a standard normal. Gradients are computed at every size; the
-    rest up to 10 qubits (the Lie algebra up to 4), where it takes seconds.
+    Parameters are drawn from their initial distribution, inputs from a standard normal. Gradients are computed at every
+    size; the rest up to 10 qubits (the Lie algebra up to 4), which takes seconds.
 
     Parameters
     ----------
     name:
-        Of an ansatz (`qrlsuite list ansatzes`), or a function of your own, (qubits, layers) to a `Circuit`.
+        Name of an ansatz (`qrlsuite list ansatzes`), or a function of your own, (qubits, layers) to a `Circuit`.
     qubits:
         Numbers of qubits: one, several, or text: `4:12` is 4 to 12, both included, `2:16:2` every second, `4,6,10`.
     layers:
@@ -340,9 +340,9 @@ def diagnose_ansatz(
     draws:
         Random parameters and inputs for the variance of gradients, 2 or more.
     seed:
-        Of everything that is drawn.
+        Seed of all draws.
     options:
-        Of the ansatz, such as `{"gate": "xyz"}`.
+        Options of the ansatz, such as `{"gate": "xyz"}`.
     progress:
         Whether to show a bar.
 
@@ -418,7 +418,7 @@ def _moved(bar: Bar, what: str, done: float, each: float, draws: int) -> None:
 
 
 def _scanned(circuit: Circuit, layers: int, found: Mapping[str, Any], seed: int) -> Scanned:
-    """Return what is known of one size; what would take long is left out."""
+    """Return the facts on one size; slow computations are left out."""
     small = circuit.qubits <= circuits.LARGEST
     state = small and not circuit.mean_field
     frequencies = power = None

@@ -91,8 +91,8 @@ def board(
         One; None means all, one after the other. Several are compared together: the entries that were trained on
         all of them with the same options, by means over the tasks.
     by:
-        `steps`; `executions` (of circuits), `shots` or `core-hours`: what learning cost, within the same budget for
-        all; `score`, the mean of the last tenth of the epochs, or `area`, that of all; or a metric that the task's
+        `steps`; `executions` (of circuits), `shots` or `core-hours`: the cost of learning, within one budget for all;
+        `score`, the mean of the last tenth of the epochs, or `area`, the mean of all; or a metric that the task's
         `[ranking] costs` names, by the last tenth of the epochs, less first. Entries whose record does not
         hold a cost, or not so that it can be compared, have no rank, and a `price.problem` that says why.
     runs, published:
@@ -229,7 +229,7 @@ def compare(
     published: bool = False,
     rule: str | None = None,
 ) -> EntryComparison:
-    """Say which of two entries needs fewer steps, by how much and how surely.
+    """Compare two entries: which needs fewer steps, by how much and how surely.
 
     All seeds of both count, up to the shorter horizon. In the cells of the task's ranking grid both are compared at
     equal numbers of seeds.
@@ -237,11 +237,11 @@ def compare(
     Parameters
     ----------
     first, second:
-        What `load` accepts, or what it returns.
+        Arguments of `load`, or its results.
     task, runs, published:
         As for `load`.
     rule:
-        As for `board`: what counts as significant in a cell.
+        As for `board`: the rule for significance in a cell.
 
     Returns
     -------
@@ -309,7 +309,7 @@ def plot(
     Parameters
     ----------
     kind:
-        What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
+        Kind of picture, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
     task, entries, horizon, runs, published:
         As for `board`. Without `entries` all of the task are drawn, the smallest model first.
     seeds:
@@ -355,7 +355,7 @@ def plot(
 
 
 def _family(shown: Sequence[EntryResults], ranked: Sequence[EntryResults]) -> list[EntryResults]:
-    """Return what is compared: all ranked entries of the same definitions of tasks, and those shown beside them."""
+    """Return the entries to compare: all ranked entries of the same definitions of tasks, and the shown ones."""
     hashes = {entry.task_hash for entry in shown}
     family = [entry for entry in ranked if entry.task_hash in hashes]
     keys = {(entry.task_hash, entry.name) for entry in family}

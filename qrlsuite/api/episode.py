@@ -54,9 +54,9 @@ class Episode(Shown):
     seed:
         Seed of the agent.
     runs:
-        Finished runs, of which it has the best last validation score.
+        Number of finished runs; this one has the best last validation score.
     task, number:
-        The task, and the number of the episode among those of the evaluation.
+        The task, and the number of the episode in the evaluation.
     actions, rewards:
         Of its K steps: (K, ...) and (K,).
     score:
@@ -80,7 +80,7 @@ class Episode(Shown):
     fps: float
 
     def __str__(self) -> str:
-        """Say in a line who played what, and with what success."""
+        """Return policy, task and score in a line."""
         score = "" if np.isnan(self.score) else f", score {self.score:.3f}"
         return (
             f"{self.policy}, seed {self.seed} (best of {self.runs}): episode {self.number} of {self.task}, "
@@ -146,7 +146,7 @@ def check_ending(file: Path) -> None:
     Raises
     ------
     OptionError
-        Saying which endings there are, or what has to be installed.
+        Names the possible endings, or the package to install.
     """
     if file.suffix not in ENDINGS:
         raise OptionError(f"--out {file}: the file's ending must be {' or '.join(ENDINGS)}")

@@ -39,7 +39,7 @@ WIDE = 100
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Shown):
-    """What policies earned on the same fresh episodes of one task.
+    """Results of policies on the same fresh episodes of one task.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Evaluation(Shown):
     episodes: int
     seed: int
     score: str = "score"
-    """What the task ranks: `score`, or the name of a metric."""
+    """Name of the task's ranked number: `score`, or a metric's name."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values: mean, percentiles and extremes of every policy."""
@@ -118,7 +118,7 @@ class Evaluation(Shown):
         yield table
 
     def _notes(self) -> list[str]:
-        """Say how the agents were chosen, and what the choice promised against what came."""
+        """Return notes: the choice of the agents, and their validation scores against these results."""
         scores = f"{self.score}: as the task defines it; " * any(
             each.scores is not None for each in self.policies
         )

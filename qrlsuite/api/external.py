@@ -46,15 +46,15 @@ def import_curves(
     steps:
         (K,) environment steps of `points`, increasing.
     task:
-        A task of the suite, of which the curves are; or the name of a new one, `external` where it is None. Later
-        imports into it need no other option.
+        The suite's task of the curves; or the name of a new task, `external` if it is None. Later imports into it need
+        no other option.
     maximum:
         The best possible score: scores become fractions of it, in [0, 1].
     thresholds:
         Scores that count as reached, for a new task; by default .6, .7, .8 and .9 of the maximum.
     every:
-        Environment steps between two grid points of a new task. By default those of the curves where they are equal,
-        else a round number that gives 100 points or fewer.
+        Environment steps between two grid points of a new task. By default the curves' own if they are equal, else a
+        round number that gives 100 points or fewer.
     metric:
         The column of a csv file or a table, or the scalar of TensorBoard or W&B, that is the score.
     goal:
@@ -65,7 +65,7 @@ def import_curves(
     Returns
     -------
     list of Imported
-        For each entry its `label`, `task`, and the seeds that are `new`; `notes` say what to know.
+        For each entry its `label`, `task`, and the seeds that are `new`; `notes` have warnings.
 
     Raises
     ------

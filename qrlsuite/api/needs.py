@@ -45,7 +45,7 @@ class SeedsNeeded(Shown):
     needs:
         For each difference and power one row of plain values.
     basis:
-        What the core-hours rest on.
+        Basis of the core-hours.
     draws:
         Simulated pairs of each row.
     """
@@ -71,7 +71,7 @@ class SeedsNeeded(Shown):
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show a row for each difference and power, and what they rest on."""
+        """Show a row for each difference and power, and their basis."""
         heads = ("difference", "power", "seeds, all at once", "seeds with looks: mean (most)", "its looks")
         rows, before = [], None
         for need in self.needs:
@@ -152,7 +152,7 @@ def seeds_needed(
 def _jobs(
     entries: Sequence[EntryResults], curves: Sequence[LearningCurves], draws: int
 ) -> list[tuple[str, Callable[[], tuple[Need, ...]]]]:
-    """Return what is simulated: the difference between two entries, then fixed ones."""
+    """Return the simulations: the difference between two entries, then fixed differences."""
     ranking = ranked.ranking_of(entries)
     grid = ranking.grid
     bounds = (0.0, 1.0) if ranking.thresholds is None else None
@@ -173,7 +173,7 @@ def _jobs(
 def _core_hours(
     entries: Sequence[EntryResults], curves: Sequence[LearningCurves], runs: Path
 ) -> tuple[float | None, str]:
-    """Return the core-hours of a seed of each of two entries together, None where unknown; and what that rests on."""
+    """Return the core-hours of a seed of each of two entries together (None if unknown), and their basis."""
     speeds = speed.known(runs)
     total, bases = 0.0, dict[str, list[str]]()
     for entry, learned in ((entries[0], curves[0]), (entries[-1], curves[-1])):

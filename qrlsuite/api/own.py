@@ -16,17 +16,17 @@ from qrlsuite.results import codes
 
 Thing = TypeVar("Thing")
 SIZE = 4, 2
-"""Qubits and layers of a circuit that is shown."""
+"""Qubits and layers of a shown circuit."""
 SHAPE = 3, 3
-"""Inputs and outputs of a model that is shown."""
+"""Inputs and outputs of a shown model."""
 
 
 def register(thing: Thing) -> Thing:
-    """Register a function, a class, a spec, or a plugin's file or folder, under its name, and show what it makes.
+    """Register a function, a class, a spec, or a plugin's file or folder, under its name, and show its result.
 
-    As a decorator it stands above a function or class in a cell. After an edit, run the cell again: what is registered
-    then takes the place of what the cell registered before. Results stay under the code that made them: `train` refuses
-    to continue seeds of other code, unless `fresh=True` sets them aside.
+    As a decorator it stands above a function or class in a cell. After an edit, run the cell again: its things replace
+    the ones that the cell registered before. Results stay under the code that made them: `train` refuses to continue
+    seeds of other code, unless `fresh=True` sets them aside.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def _of_cell(thing: Any, place: str) -> own.Loaded:
 
 
 def _module(name: str) -> str:
-    """Return the name of a cell's module: that of the thing, unless Python has another of that name."""
+    """Return the name of a cell's module: the thing's name, unless Python has a module of that name."""
     word = name.replace("-", "_").replace(".", "_")
     return word if own.is_free(word) else f"own_{word}"
 
@@ -146,7 +146,7 @@ def _moved(spec: specs.Spec, module: str) -> specs.Spec:
 
 
 def _show(made: own.Loaded) -> None:
-    """Print what was registered, and what it makes."""
+    """Print the registered things, and show their results."""
     print(made.sentence)
     for each in made.registered:
         try:

@@ -30,7 +30,7 @@ def agent(
     task:
         The task that it plays, as for `evaluate`; None is the entry's own.
     seed:
-        Of the agent; None takes the one with the highest last validation score.
+        Seed of the agent; None takes the agent with the highest last validation score.
     published:
         Look among the published entries that come with the suite, too.
     runs:
@@ -43,7 +43,7 @@ def agent(
     OptionError
         If the agent cannot play the task.
     StoreError
-        If the entry has no trained agent, or none of the seed.
+        If the entry has no trained agent, or no agent of that seed.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def play(
 ) -> Episode:
     """Play an episode with an entry's best trained agent, and draw it.
 
-    The best is that with the highest last validation score, and the episode one of those of `evaluate`.
+    The best agent has the highest last validation score, and the episode is an episode of `evaluate`.
 
     Parameters
     ----------

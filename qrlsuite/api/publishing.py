@@ -71,7 +71,7 @@ def export(
     agents: bool,
     runs: Path,
 ) -> Iterator[Exported]:
-    """Write entries, those of studies, or studies with looks as published files.
+    """Write entries, studies' entries, or studies with looks as published files.
 
     Parameters
     ----------
@@ -170,12 +170,12 @@ class ToVerify:
 
 
 def find_published(paths: Sequence[Path], base: str | None) -> ToVerify:
-    """Find what is published in folders, or differs from a git commit.
+    """Find published entries and studies in folders, or the ones that differ from a git commit.
 
     Parameters
     ----------
     paths:
-        Entries, or folders of entries; empty for those of the suite.
+        Entries, or folders of entries; empty for the suite's.
     base:
         A git commit; None looks at `paths`.
 
@@ -213,7 +213,7 @@ def read_rerun(text: str) -> tuple[checks.Wanted, int | None]:
 
 
 def _read_study(folder: Path) -> dict[str, Any]:
-    """Read a published study, and say what is wrong with it."""
+    """Read a published study, with an error message if it is damaged."""
     content = {"study": folder.name, "folder": str(folder)}
     try:
         outcome = published_studies.read(folder)

@@ -1,4 +1,4 @@
-"""What `qrlsuite show` shows of whatever has a name, as plain values."""
+"""Descriptions for `qrlsuite show` of everything that has a name, as plain values."""
 
 from __future__ import annotations
 
@@ -50,23 +50,23 @@ def describe(
     Parameters
     ----------
     name:
-        Of the thing; of an entry its label or folder, of a study its file or folder, too.
+        Name of the thing; for an entry also its label or folder, for a study its file or folder.
     kind:
         `model`, `ansatz`, ...; None looks among all.
     settings:
-        Of an ansatz: its options, `qubits` and `layers`.
+        For an ansatz: its options, `qubits` and `layers`.
     code:
-        Describe the code identity, and what it is taken of.
+        Describe the code identity, and its parts.
     out, format:
-        Of an ansatz: a file for its drawing; the language of a program (`qasm3`, `qiskit`, `pennylane`). Of a task, the
-        format may be `toml`: its file, to be saved and changed.
+        For an ansatz: a file for its drawing; the language of a program (`qasm3`, `qiskit`, `pennylane`). For a task,
+        the format may be `toml`: its file, to be saved and changed.
     runs, published:
         As for `load`.
 
     Returns
     -------
     dict or Overview or StudyOutcome or StudiesTogether
-        Of a study how far it is, as `read_study` returns it.
+        For a study the result of `read_study`.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def describe(
 
 
 def is_study(name: str) -> bool:
-    """Return whether a name can only be a study's: that of its file, or of a published one or its folder."""
+    """Return whether a name can only be a study's: a study file, or a published study or its folder."""
     if name.endswith(".toml"):
         return not is_task_file(Path(name))
     return published_studies.folder_of(name) is not None
@@ -162,12 +162,12 @@ def _code_of_plugin(kind: type[specs.Spec], name: str) -> dict[str, Any]:
 
 
 def _stored(selection: Selection, name: str) -> EntryStore | None:
-    """Find an entry by its folder, or by what it is called in the results folder; None where nothing fits.
+    """Find an entry by its folder, or by its name in the results folder; None if nothing fits.
 
     Raises
     ------
     UnknownNameError
-        If several fit, or none of the published ones does.
+        If several fit, or no published entry does.
     """
     if (Path(name) / "entry.json").exists():
         return EntryStore(Path(name))

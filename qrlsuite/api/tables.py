@@ -34,11 +34,11 @@ def table(
     Parameters
     ----------
     rows:
-        What a row is: one of `entries`, of their `seeds`, or of the `epochs` of these, which are the learning curves.
+        Kind of rows: `entries`, their `seeds`, or the `epochs` of seeds, which are the learning curves.
     task:
         The entries of this one, or of several; None means all.
     entries:
-        These only: what `load` accepts, or what it returns.
+        The only entries: arguments of `load`, or its results.
     horizon:
         Environment steps to which all are cut; shorter ones are left out, and a warning names them. None cuts nothing:
         compare scores only where `steps` are equal.
@@ -92,7 +92,7 @@ def table(
 
 
 def progress_table(runs: Path, statuses: Sequence[EntryStatus]) -> list[dict[str, Any]]:
-    """Return a row of values for each entry of a results folder: how far it is, and what `table` says of it."""
+    """Return a row of values for each entry of a results folder: its progress, and its row of `table`."""
     results = {}
     if statuses:
         found, _ = collect.collect(Selection.create(runs, [status.entry.task for status in statuses]))

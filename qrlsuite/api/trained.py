@@ -32,7 +32,7 @@ class TrainedAgent:
     seed:
         Its seed.
     runs:
-        Finished runs, of which it has the best last validation score; 1 where its seed was given.
+        Number of finished runs; this one has the best last validation score. 1 if its seed was given.
     entry, trainer:
         The entry, on the task that it plays, and the population of this agent alone.
     """
@@ -64,7 +64,7 @@ class TrainedAgent:
             Where an episode begins with the observation (B,): everywhere after a reset, then `terminated | truncated`.
             Only an agent that remembers needs it.
         infos:
-            What the environments said of it. Only a task with masks needs it: `infos["action_mask"]` (B, choices).
+            The environments' infos on it. Only a task with masks needs them: `infos["action_mask"]` (B, choices).
 
         Raises
         ------

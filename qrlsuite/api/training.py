@@ -75,10 +75,10 @@ def train(
     epochs:
         The epoch to which each is trained; None takes the task's protocol.
     engine:
-        Where the work is done: a name (`qrlsuite list engines`), or what `qrlsuite.engine.where.Where.create` built
-        of a name and options.
+        Place of the work: a name (`qrlsuite list engines`), or a result of `qrlsuite.engine.where.Where.create` with a
+        name and options.
     workers:
-        Processes, or tasks in a queue; None takes one per core, or what the engine takes.
+        Processes, or tasks in a queue; None takes one per core, or the engine's default.
     device:
         `cpu`, `cuda` or `cuda:1`.
     budget:
@@ -222,29 +222,29 @@ def tune(
     task, engine, workers, device, fresh, same, runs:
         As for `train`. Trials lie below `runs`/tuning.
     entries:
-        What is tuned: `"mlp width=16"`, or several, which get equal budgets. Options that are written are not varied.
+        Entries to tune: `"mlp width=16"`, or several, which get equal budgets. Their written options are not varied.
     vary:
-        What is varied: lists of values, or ranges, `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`; or
+        Varied options: lists of values, or ranges, `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`; or
         words as on the command line: a grid's name (`"paper"`), a grid file's path, `"lr=1e-3,5e-4"`; settings that
         `bayesian` tries first, `"lr=.002 buffer=10000"`. `bayesian` also varies the options that models and algorithms
         mark as `Tuned`.
     sampler:
         `bayesian`, `grid`, `one-at-a-time`, `random` or `tpe`, with options `trials` and `seed`: `"random trials=50"`;
-        `"bayesian regret=.03"`. None takes all combinations of what `vary` lists, and `bayesian` without lists.
+        `"bayesian regret=.03"`. None takes all combinations of the lists in `vary`, and `bayesian` without lists.
     seeds:
         Runs of each trial: a number counts from seed 1,000,000. None takes 20, with `bayesian` 4.
     epochs:
-        Of each trial; None takes the task's protocol.
+        Epochs of each trial; None takes the task's protocol.
     objective:
-        What is minimized: steps below threshold (`time`), sample complexity at the task's reference `cell`, or its
-        mean over the ranking grid (`area`).
+        The number to minimize: steps below threshold (`time`), sample complexity at the task's reference `cell`, or
+        its mean over the ranking grid (`area`).
     budget:
         `"30min"`: begin no trial that would not end within this time; every call gets it anew. `"2core-hours"` with
         `bayesian`: as many trials as this holds, for each entry.
     out:
         The preset file, ending in .toml; None takes one below `runs`.
     progress:
-        Whether to show what is searched, and a bar on a terminal or in a notebook.
+        Whether to show the search space, and a bar on a terminal or in a notebook.
 
     Returns
     -------
@@ -288,12 +288,12 @@ def plan_tuning(
     runs: str | PathLike[str],
     progress: bool,
 ) -> tuple[list[Search], TuneDisplay, Path | None]:
-    """Build the searches that `tune` and the command run, and show them; the arguments are those of `tune`.
+    """Build the searches that `tune` and the command run, and show them; arguments as for `tune`.
 
     Returns
     -------
     tuple
-        The searches, what shows them, and the preset file of a single search, None for one below `runs` of each.
+        The searches, their display, and the preset file of a single search, None for a file of each below `runs`.
     """
     check_positive("epochs", epochs)
     requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective, budget)
@@ -352,7 +352,7 @@ def evaluate(
     runs:
         The results folder.
     progress:
-        Whether to show what is to be executed, and a bar, on a terminal or in a notebook.
+        Whether to show the planned executions, and a bar, on a terminal or in a notebook.
 
     Returns
     -------

@@ -19,16 +19,16 @@ from qrlsuite.training.trainer import Trainer
 
 
 def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None = None) -> Entry:
-    """Return an entry whose seeds begin with trained agents, which are put into its folder: seed k with that of seed k.
+    """Return an entry whose seeds begin with trained agents, which are put into its folder: seed k with seed k's agent.
 
     Parameters
     ----------
     entry:
-        What is to be trained.
+        The entry to train.
     name:
         The entry of the agents: one of the same task, `TASK/ENTRY`, or a folder; of the results folder, or published.
     seeds:
-        Those that are to be trained; None takes those of the task's protocol. Agents that are there stay.
+        The seeds to train; None takes the task's protocol. Existing agents stay.
 
     Raises
     ------

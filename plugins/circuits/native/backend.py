@@ -40,7 +40,7 @@ class NativeBackend:
     Parameters
     ----------
     circuit:
-        What to run; its whole content is copied here, later changes have no effect.
+        The circuit to run; its whole content is copied here, later changes have no effect.
     options:
         Shots, noise and gradient; by default values are exact.
 
@@ -140,7 +140,7 @@ class NativeBackend:
 
     @cached_property
     def program(self) -> Program:
-        """What devices other than the CPU run: steps on the whole state, made when first needed."""
+        """The program for devices other than the CPU: steps on the whole state, made when first needed."""
         return compile_circuit(self.circuit)
 
     @cached_property
@@ -212,7 +212,7 @@ def trouble() -> str | None:
 
 
 def _check(options: NativeOptions, circuit: Circuit) -> None:
-    """Refuse options that would do nothing, and shots or noise of what is no circuit."""
+    """Refuse options without effect, and shots or noise of a mean-field approximation."""
     if options.noise_model is None:
         defaults = NativeOptions()
         for name in ("noise_rate", "readout_error", "trajectories"):

@@ -15,14 +15,14 @@ from qrlsuite.compiled.cache import announce
 from qrlsuite.plugins.circuits.native.program import compile_circuit
 
 KEEP_BYTES = 256 << 20
-"""Final states and gates up to this size are kept for the backward pass; larger ones are computed again."""
+"""Final states and gates up to this size stay for the backward pass; larger ones are computed again."""
 
 APART = 17
 """Rows between the two states of a backward pass. Without them equal rows lie a power of two apart, where a processor
 takes a load from one for dependent on a store to the other, and both for the same place in its first-level cache."""
 
 SPARE_BYTES = 64 << 20
-"""Memory up to this size is kept from one pass to the next, one array per circuit and precision."""
+"""Memory up to this size stays from one pass to the next, one array per circuit and precision."""
 
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 

@@ -168,7 +168,7 @@ def _steps(program: Program, component: Component) -> list[list[int]]:
 
 
 def diagonals(program: Program, like: Tensor) -> list[Tensor]:
-    """Return every component's diagonals of all observables, (2^n, O) each; type and device are those of `like`."""
+    """Return every component's diagonals of all observables, (2^n, O) each; type and device as of `like`."""
     return [_diagonals(program, component, like) for component in _components(program)]
 
 

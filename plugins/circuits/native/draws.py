@@ -26,7 +26,7 @@ _STIRLING = np.array(
 
 @inlined
 def _stirling(k: Any) -> Any:
-    """Return what Stirling's formula for log(k!), around k + 1, lacks."""
+    """Return the error of Stirling's formula for log(k!), around k + 1."""
     if k < 10:
         return _STIRLING[int(k)]
     square = 1.0 / ((k + 1.0) * (k + 1.0))
@@ -98,8 +98,8 @@ def _binomial(n: int, p: float, source: Any) -> int:
 def _place(sums: Any, value: float) -> int:
     """Return the first place whose sum is above the value.
 
-    Rounding can make the value the last sum itself. It belongs to the first place that reaches this sum: those behind
-    it have probability 0.
+    Rounding can make the value the last sum itself. It belongs to the first place that reaches this sum: later places
+    have probability 0.
     """
     first, last = 0, len(sums) - 1
     while first < last:

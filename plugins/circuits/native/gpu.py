@@ -50,7 +50,7 @@ class GPUSimulator:
     Parameters
     ----------
     program:
-        What to run.
+        The program to run.
     """
 
     def __init__(self, program: Program) -> None:
@@ -72,7 +72,7 @@ class GPUSimulator:
         return self.largest <= MOST_QUBITS and needed <= _shared_limit(like.device.index or 0)
 
     def tables(self, like: Tensor) -> tuple[list[Any], list[Any]]:
-        """Return the program's arrays on a tensor's device: those of both passes, and those of `collect`."""
+        """Return the program's arrays on a tensor's device: for both passes, and for `collect`."""
         key = (like.device, like.dtype)
         if key not in self._tables:
             run, gather = _run_tables(self.program), _collect_tables(self.program)
@@ -96,7 +96,7 @@ def _tensor(array: NDArray[Any], like: Tensor) -> Tensor:
 
 
 def _run_tables(program: Program) -> list[NDArray[Any]]:
-    """Return what both passes read; steps that permute point into `sources`."""
+    """Return the arrays that both passes read; steps that permute point into `sources`."""
     steps = program.steps.copy()
     sources: list[NDArray[Any]] = []
     for component in program.components.tolist():
@@ -128,7 +128,7 @@ def _run_tables(program: Program) -> list[NDArray[Any]]:
 
 
 def _collect_tables(program: Program) -> list[NDArray[Any]]:
-    """Return the angles, and those of every parameter and of every input: lists, and where each begins."""
+    """Return the angles, and lists of angles by parameter and by input, with the begin of each list."""
     by_parameter: list[list[tuple[int, int]]] = [[] for _ in range(program.parameters)]
     by_input: list[list[int]] = [[] for _ in range(program.inputs)]
     for index, (which, scale, weight) in enumerate(program.angles.tolist()):
@@ -149,7 +149,7 @@ def _collect_tables(program: Program) -> list[NDArray[Any]]:
 
 
 def _view(tensor: Tensor) -> Any:
-    """Return a tensor's memory for a kernel; that of the CPU where numba simulates a GPU."""
+    """Return a tensor's memory for a kernel; the CPU's memory if numba simulates a GPU."""
     return cuda.as_cuda_array(tensor, sync=False) if tensor.is_cuda else tensor.numpy()
 
 

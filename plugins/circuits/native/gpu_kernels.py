@@ -382,7 +382,7 @@ def kernels(kind: Any) -> dict[str, Any]:
         psi: Any,
         lam: Any,
     ) -> None:
-        """Undo every step on both states, last step first; `overlaps` (4 G) receives those of every block."""
+        """Undo every step on both states, last step first; `overlaps` (4 G) receives the overlaps of every block."""
         size = psi.shape[0] // 2
         me, threads = cuda.threadIdx.x, cuda.blockDim.x
         for c in range(components.shape[0]):

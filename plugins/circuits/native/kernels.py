@@ -128,7 +128,7 @@ def prepare(t: Any, flat: Any, seed: int, inputs: Any, trig: Any, gates: Any) ->
 
 @inlined
 def _component(t: Any, c: int, states: Any) -> Any:
-    """Return a component's number of qubits, and its state as a view of that of all components."""
+    """Return a component's number of qubits, and its state as a view of the state of all components."""
     qubits, first = t.components[c, 0], t.components[c, 1]
     return qubits, states[2 * first : 2 * (first + (1 << qubits))]
 
@@ -369,7 +369,7 @@ def backward(
 ) -> None:
     """Compute gradients of sum(cotangent * expectation values): grad_inputs (S, B, I), grad_flat (S, P).
 
-    `records` are what `forward` kept; where `kept` is 0 they are computed again. `pair` (2, 2^(n + 1), V) holds psi
+    `records` are the records of `forward`; if `kept` is 0 they are computed again. `pair` (2, 2^(n + 1), V) holds psi
     and lambda of one chunk, `overlap` (4, V), `sums` (P, V) and `slopes` (I, V) its gradients.
     """
     lanes = w.inputs.shape[1]
@@ -409,7 +409,7 @@ def advance(t: Any, angles: Any, records: Any, first: int, fresh: int, inputs: A
     """Bring the states of all chunks through a program of one component, see `states`.
 
     `angles` (1, B, A) are the program's inputs. `records` (K, R, V) hold the states in their first rows, and receive
-    what `retreat` needs from row `first` on. Where `fresh` is 1, states begin in |0...0>. `inputs` (A, V) is scratch.
+    data for `retreat` from row `first` on. If `fresh` is 1, states begin in |0...0>. `inputs` (A, V) is scratch.
     """
     for chunk in range(records.shape[0]):
         trig, gates = _place(t, records[chunk], first)
@@ -436,7 +436,7 @@ def retreat(
 ) -> None:
     """Undo a program on psi and lambda of all chunks, (K, 2^(n + 1), V) each, and add to `gradient` (B, A).
 
-    `records` are what `advance` left; `inputs` and `slopes` (A, V) and `overlap` (4, V) are scratch.
+    `records` are the records of `advance`; `inputs` and `slopes` (A, V) and `overlap` (4, V) are scratch.
     """
     lanes = inputs.shape[1]
     zero = splat(inputs, 0.0)
@@ -455,7 +455,7 @@ def retreat(
 def words(terms: Any, weights: Any, owners: Any, qubits: int, records: Any, lane: Any, out: Any) -> None:
     """Add the mean of every Pauli word to the value out (B, O) of the observable that owns it.
 
-    `terms` (W, 3): the bits that a word flips (X, Y), those that give a sign (Y, Z), and its number of Y. `weights`
+    `terms` (W, 3): the bits that a word flips (X, Y), the bits that give a sign (Y, Z), and its number of Y. `weights`
     (W,) are their coefficients, `owners` (W,) the observables. `lane` (1, V) is scratch.
     """
     lanes = lane.shape[1]

@@ -146,7 +146,7 @@ def scratch(program: MeanFieldProgram, lanes: int, dtype: Any) -> Scratch:
 def record_rows(program: MeanFieldProgram) -> tuple[int, int, int]:
     """Return how many rows of lanes a chunk's record has: vectors, sines and cosines, blocks.
 
-    The vectors are 3 rows per qubit, and 6 per step: those of its two qubits before it.
+    The vectors are 3 rows per qubit, and 6 per step: the vectors of its two qubits before it.
     """
     vectors = 3 * program.qubits + 6 * len(program.steps)
     return vectors, 2 * len(program.rotations), 6 * (len(program.blocks) - 1)
@@ -246,7 +246,7 @@ def forward(t: Any, inputs: Any, flat: Any, records: Any, keep: int, w: Any, out
 def _unrotate(
     states: Any, mu: Any, gates: Any, kept: int, control: int, target: int, block: int, overlap: Any
 ) -> None:
-    """Take the gradient `mu` by the vectors after a gate back to those before it, and by its angles to `overlap`.
+    """Pull the gradient `mu` by vectors after a gate back to the vectors before it, and by its angles to `overlap`.
 
     An infinitesimal rotation by e after the gate changes U by -i/2 (e . sigma) U, and R r by e x R r; `overlap` is
     the gradient by e, and -1/2 that by theta.
@@ -301,7 +301,7 @@ def backward(
 ) -> None:
     """Compute gradients of sum(cotangent * values): grad_inputs (S, B, I), grad_flat (S, P).
 
-    `records` are what `forward` kept; where `kept` is 0 they are computed again. `pair[0]` holds the gradients by
+    `records` are the records of `forward`; if `kept` is 0 they are computed again. `pair[0]` holds the gradients by
     the vectors, `overlap` (4, V) by a gate, `sums` (P, V) and `slopes` (I, V) by parameters and inputs.
     """
     lanes = w.inputs.shape[1]

@@ -1,15 +1,15 @@
-"""Random Pauli errors between gates, without a gate for any of them.
+"""Random Pauli errors between gates, without gates for the errors.
 
 A depolarizing channel of rate p replaces its qubits by random ones with probability p, which is the same as applying
 one of the 4^k Pauli operators, the identity among them, each with probability p / 4^k. A *trajectory* is one draw of
 all errors of a circuit; the mean over trajectories is an unbiased estimate of the noisy expectation value (Dalibard,
 Castin & Molmer 1992, Phys. Rev. Lett. 68, 580; for Pauli channels every trajectory is a unitary circuit). Errors follow
-each elementary gate (`qrlsuite.circuit.elementary`), so that rates mean what they mean on the Qiskit backend.
+each elementary gate (`qrlsuite.circuit.elementary`), so that rates mean the same as on the Qiskit backend.
 
 Errors are carried to the end of the circuit (Knill 2005, Nature 434, 39). A rotation exp(-i a P / 2) lets a Pauli error
 pass that commutes with P, and turns the other way, a to -a, for one that does not. Other gates turn errors into
-errors: a CNOT copies an X from control to target, and a Z from target to control. What arrives at the end as an X flips
-the measured bit. So a trajectory is the circuit itself, with some angles negated and some bits flipped.
+errors: a CNOT copies an X from control to target, and a Z from target to control. An error that arrives at the end as
+an X flips the measured bit. So a trajectory is the circuit itself, with some angles negated and some bits flipped.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ says whether it has an X, bit 2 k + 1 whether it has a Z."""
 
 
 class Errors(NamedTuple):
-    """What errors do to the circuit in the H trajectories on which they have an effect."""
+    """The effect of errors on the circuit in the H trajectories with an effect."""
 
     hit: NDArray[np.int64]
     """(H,): these trajectories, in order. An error may also be the identity, or meet nothing that it changes."""
@@ -53,7 +53,7 @@ class PauliNoise:
     qubits:
         Its number n of qubits.
     rate:
-        Of two-qubit gates; that of one-qubit gates is a tenth of it.
+        Rate of two-qubit gates; the rate of one-qubit gates is a tenth of it.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def _anticommute(rotation: str, x: Bits, z: Bits) -> Bits:
 
 
 def _pass(gate: str, wires: tuple[int, ...], x: Bits, z: Bits) -> None:
-    """Change errors (n, H) in place to what they are behind a fixed gate."""
+    """Move errors (n, H) in place behind a fixed gate."""
     first, last = wires[0], wires[-1]
     if gate == "H":
         x[first], z[first] = z[first].copy(), x[first].copy()

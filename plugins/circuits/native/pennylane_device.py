@@ -2,8 +2,8 @@
 
 Gates that the kernels know run in them, gates without angles on few wires by their matrix, and all others in
 PennyLane's own decomposition. Broadcast samples, and circuits of one execution that differ in their angles alone (as
-those of the parameter-shift rule do), run as lanes of one pass. Expectation values of Pauli words are measured in
-kernels; all else, and everything with shots, by the functions with which `default.qubit` measures its state.
+in the parameter-shift rule), run as lanes of one pass. Expectation values of Pauli words are measured in kernels; all
+else, and everything with shots, by the functions with which `default.qubit` measures its state.
 """
 
 from __future__ import annotations
@@ -122,11 +122,11 @@ class NativeDevice(Device):  # type: ignore[misc]  # PennyLane has no types
     Parameters
     ----------
     wires:
-        Number of wires or their labels; None for those of each circuit.
+        Number of wires or their labels; None for each circuit's own wires.
     shots:
         As of every PennyLane device; None for exact values.
     seed:
-        Of the shots: an integer, None for fresh entropy, or "global" for a draw from numpy's global generator.
+        Seed of the shots: an integer, None for fresh entropy, or "global" for a draw from numpy's global generator.
     """
 
     def __init__(self, wires: Any = None, shots: Any = None, seed: Any = "global") -> None:
@@ -178,7 +178,7 @@ class NativeDevice(Device):  # type: ignore[misc]  # PennyLane has no types
         return replace(config, **changed)
 
     def preprocess_transforms(self, execution_config: ExecutionConfig | None = None) -> Any:
-        """Return what PennyLane does with circuits before they run here."""
+        """Return PennyLane's transforms of circuits before they run here."""
         config = execution_config or ExecutionConfig()
         program = TransformProgram()
         program.add_transform(defer_measurements, allow_postselect=False)
@@ -286,7 +286,7 @@ def _rule(op: Any) -> Rule | None:
 
 
 def _runs(op: Any) -> bool:
-    """Return whether a gate runs as it is; all others are decomposed."""
+    """Return whether a gate runs without decomposition."""
     if _rule(op) is not None:
         return True
     if len(op.wires) > MATRIX_WIRES or not op.has_matrix:
@@ -301,7 +301,7 @@ def _runs(op: Any) -> bool:
 
 @transform
 def _width_checked(tape: Circuit) -> Any:
-    """Refuse circuits that are too wide, those after deferred measurements included."""
+    """Refuse circuits that are too wide, also after deferring measurements."""
     _require_width(len(tape.wires))
     return (tape,), _first
 
@@ -386,7 +386,7 @@ def _vector(prep: Any, qubits: int) -> NDArray[np.complex128]:
 
 
 def _observables(job: Job) -> Observables | None:
-    """Return what the kernels measure of a circuit; None where PennyLane measures its states."""
+    """Return the observables that the kernels measure; None if PennyLane measures the states."""
     circuit = job.circuit
     if circuit.shots or not all(type(m) is ExpectationMP and m.obs is not None for m in circuit.measurements):
         return None

@@ -13,7 +13,7 @@ H, CNOT, X, SWAP, CZ and Z are fixed: neighboring CNOT, X and SWAP are collected
 neighboring CZ and Z into one pattern of signs. S, T and Y equal rotations by constant angles up to a global phase.
 
 A gate joins an earlier step where everything between acts on other qubits. Hadamards that open the circuit cost
-nothing: the state begins in their product. Those behind a controlled block, on its control or target, join its sweep,
+nothing: the state begins in their product. Others behind a controlled block, on its control or target, join its sweep,
 as sums and differences without their factor 1 / sqrt 2: the multiplications, not the additions, fill the processor's
 units there. The initial state carries these factors. Other Hadamards are collected up to three at a time, a sweep with
 factor over 8 amplitudes.
@@ -50,9 +50,9 @@ class Component(NamedTuple):
 
     qubits: int
     amplitude: int
-    """Where its 2^qubits amplitudes begin among those of all components."""
+    """Begin of its 2^qubits amplitudes among the amplitudes of all components."""
     bit: int
-    """Where its expectation values, bit by bit, begin among those of all components."""
+    """Begin of its expectation values, bit by bit, among the values of all components."""
     first: int
     """Its steps are `first` up to, but not including, `last`."""
     last: int
@@ -129,7 +129,7 @@ class Program:
 
 @dataclass
 class _Step:
-    """A step under construction: what it is, and which bits it touches."""
+    """A step under construction: its kind, and the bits that it touches."""
 
     kind: int
     touched: set[int]
@@ -236,7 +236,7 @@ class Compiler:
     def program(
         self, inputs: int, products: Sequence[tuple[int, int]], observables: Sequence[int]
     ) -> Program:
-        """Return what has grown as a program that measures these products and observables."""
+        """Return the grown program, which measures these products and observables."""
         return Program(
             qubits=sum(c.qubits for c in self.components),
             inputs=inputs,

@@ -1,9 +1,9 @@
 """The native simulator as Qiskit's V2 primitives, in the place of `StatevectorEstimator` and `StatevectorSampler`.
 
 All parameter values of a circuit run as lanes of one pass. Gates that the kernels know run in them, gates without
-parameters on few qubits by their matrix, and all others by Qiskit's own definitions. With a seed, the numbers drawn are
-those that Qiskit's primitives draw. What a circuit measures before its end is measured at its end, on a further qubit
-where that one is used again; gates that depend on it are controlled gates, and a reset takes a further qubit.
+parameters on few qubits by their matrix, and all others by Qiskit's own definitions. With a seed, Qiskit's primitives
+draw the same numbers. A measurement within a circuit is made at its end, on a further qubit if the measured one is used
+again; gates that depend on it are controlled gates, and a reset takes a further qubit.
 """
 
 from __future__ import annotations
@@ -77,16 +77,16 @@ RULES = {
 
 @dataclass
 class Plan:
-    """A circuit of which all parameter values run together.
+    """A circuit whose parameter values run all together.
 
     Attributes
     ----------
     program, samples:
         The compiled gates, and angles of all B parameter values.
     bits:
-        Of every register by its name the wire that is measured into each of its bits, None where none is.
+        By a register's name, the wire that is measured into each of its bits, None for no wire.
     wires:
-        Of every qubit its wire: resets move it.
+        The wire of every qubit: resets move it.
     """
 
     program: StateProgram
@@ -101,9 +101,9 @@ class EstimatorV2(BaseEstimatorV2):  # type: ignore[misc]  # Qiskit has no types
     Parameters
     ----------
     default_precision:
-        Standard deviation of Gaussian noise on every mean, where `run` is given none; 0 for exact means.
+        Standard deviation of Gaussian noise on every mean, by default of `run`; 0 for exact means.
     seed:
-        Of that noise: an integer, a generator, or None for fresh entropy.
+        Seed of that noise: an integer, a generator, or None for fresh entropy.
     """
 
     def __init__(self, *, default_precision: float = 0.0, seed: Any = None) -> None:
@@ -136,9 +136,9 @@ class SamplerV2(BaseSamplerV2):  # type: ignore[misc]
     Parameters
     ----------
     default_shots:
-        Repetitions of every circuit, where `run` is given none.
+        Repetitions of every circuit, by default of `run`.
     seed:
-        Of the draws: an integer, a generator, or None for fresh entropy.
+        Seed of the draws: an integer, a generator, or None for fresh entropy.
     """
 
     def __init__(self, *, default_shots: int = 1024, seed: Any = None) -> None:
@@ -211,7 +211,7 @@ class _Deferred:
                 yield operation, tuple(self.wires[q] for q in on)
 
     def keep(self, qubits: Iterable[int]) -> Iterator[tuple[Any, tuple[int, ...]]]:
-        """Yield gates that copy what was measured to further wires, where qubits are used again."""
+        """Yield gates that copy measured bits to further wires if qubits are used again."""
         for wire in self._measured.intersection(self.wires[q] for q in qubits):
             copied = self._further()
             self._measured.remove(wire)
@@ -312,9 +312,9 @@ def _refuse_width(qubits: int) -> None:
 def _flat(
     circuit: QuantumCircuit, qubits: Sequence[int], clbits: Sequence[int]
 ) -> Iterator[tuple[Any, tuple[int, ...], tuple[int, ...]]]:
-    """Yield operations that run as they are, with qubits and bits; all others by their definitions.
+    """Yield operations with their qubits and bits; operations that cannot run are replaced by their definitions.
 
-    The bits of a condition are those that it compares.
+    The bits of a condition are the bits that it compares.
     """
     for item in circuit.data:
         operation = item.operation

@@ -1,8 +1,8 @@
 """Shots and noise on the CPU kernels: bit strings drawn from the final states of noisy trajectories.
 
 All <Z_q> of an input come from the same bit strings, as on hardware: counts of the 2^n outcomes are drawn from their
-multinomial law. Qubits that no gate connects are drawn apart. What errors between gates do is said in `noise`:
-trajectories are lanes of one compiled circuit, and the kernels need not know of errors.
+multinomial law. Qubits that no gate connects are drawn apart. Errors between gates are in `noise`: trajectories are
+lanes of one compiled circuit, and the kernels need not know of errors.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class ShotSampler:
         return torch.from_numpy(means)
 
     def _seen(self, flipped: Bits | None) -> NDArray[np.float64]:
-        """Return what readout errors and flipped bits (n, R) make of exact values, as factors (R, O), or (1, O)."""
+        """Return the factors (R, O), or (1, O), of readout errors and flipped bits (n, R) on exact values."""
         weights = np.array([len(qubits) for qubits in self._measured])
         factors = (1.0 - 2.0 * self.options.readout_error) ** weights[None]
         if flipped is None:

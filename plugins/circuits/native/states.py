@@ -1,4 +1,4 @@
-"""Final states of circuits whose angles are given sample by sample, and gradients of what is measured on them.
+"""Final states of circuits whose angles are given sample by sample, and gradients of their observables.
 
 Other libraries' circuits run here (see `pennylane_device` and `qiskit_primitives`): gates that the kernels know, in
 one compiled program for each unbroken row of them, and between these any matrix on a few qubits. Observables are sums
@@ -27,7 +27,7 @@ PASS_BYTES = 64 << 20
 """States of one pass take up to this size; more samples take several passes."""
 
 SPARE_BYTES = 8 << 20
-"""Memory up to this size is kept from one pass to the next, one array per program: fresh pages cost time."""
+"""Memory up to this size stays from one pass to the next, one array per program: fresh pages cost time."""
 
 MATRIX_WIRES = 4
 """Gates without angles on up to so many wires run by their matrix."""
@@ -102,14 +102,14 @@ class Observables:
 
 @dataclass
 class Samples:
-    """What differs from sample to sample.
+    """Data that differ from sample to sample.
 
     Attributes
     ----------
     angles:
         (B, A) radians.
     matrices:
-        Of every `Matrix`, in order: (d, d) for all samples, or (B, d, d).
+        Matrix of every `Matrix`, in order: (d, d) for all samples, or (B, d, d).
     initial:
         The state before the first gate, (2^n,) or (B, 2^n); None stands for |0...0>.
     """
@@ -314,7 +314,7 @@ class StateProgram:
 def compiled(
     qubits: int, prepared: bool, gates: tuple[tuple[Rule | None, tuple[int, ...]], ...]
 ) -> StateProgram:
-    """Return the program of these gates on their wires; None stands for a matrix. It is kept for the next call."""
+    """Return the program of these gates on their wires, cached; None stands for a matrix."""
     given: list[Operation | Matrix] = []
     count = 0
     for rule, wires in gates:

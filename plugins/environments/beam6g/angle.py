@@ -58,7 +58,7 @@ class BeamAngle(OneLane):
     17 senders along the unit vector d. The agent turns its beam, or chooses the direction theta of it, measured from d,
     at every step. It sees neither the field nor the user.
 
-    The physics is that of the paper, "Benchmarking Quantum Reinforcement Learning", appendix "6G Beam forming and RL
+    The physics is from the paper, "Benchmarking Quantum Reinforcement Learning", appendix "6G Beam forming and RL
     environment". Its codebook is a list of angles theta_i with the phase gradients phi_i = pi cos(theta_i); here theta
     is any angle. For the offset (dx, dy) from the antenna to the user,
 
@@ -99,8 +99,8 @@ class BeamAngle(OneLane):
     ## Episode End
 
     After `steps` actions the episode is *terminated*. `info["score"]` is then the sum of the received intensities over
-    that of the best, over the steps 0 to `steps`, in [0, 1]. `info["metrics"]["angle-error"]` is the mean distance of
-    the angle to the best one, radians.
+    the sum of the best ones, over the steps 0 to `steps`, in [0, 1]. `info["metrics"]["angle-error"]` is the mean
+    distance of the angle to the best one, radians.
 
     ## Arguments
 

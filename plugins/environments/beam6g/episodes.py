@@ -1,4 +1,4 @@
-"""Whole episodes as tables: what every antenna gives at every step, which no action changes.
+"""Whole episodes as tables: every antenna's intensity at every step, which no action changes.
 
 The user's path does not depend on the actions. So everything an episode can show is tabulated when it begins,
 and a step is a look-up. The single environment and the vector environment both use this module.
@@ -95,7 +95,7 @@ class EpisodeGenerator:
     def observation(
         self, antenna: NDArray[np.int64], intensity: FloatArray, beam: BeamArray
     ) -> NDArray[np.float32]:
-        """Return observations (L, 3) float32 in [0, 1] of what was served last, all (L,)."""
+        """Return observations (L, 3) float32 in [0, 1] of the last antenna, intensity and beam, all (L,)."""
         result = np.empty((len(antenna), 3), dtype=np.float32)
         result[:, 0] = antenna / (len(self.options.antennas) - 1)
         result[:, 1] = intensity

@@ -73,7 +73,7 @@ class BeamOptions:
 
 
 def checked(index: int, antenna: Antenna) -> Antenna:
-    """Return an antenna with a unit orientation, or raise a ValueError that says what is wrong."""
+    """Return an antenna with a unit orientation, or raise a ValueError that names the fault."""
     (x, y), (d_x, d_y) = antenna
     if not all(math.isfinite(value) for value in (x, y, d_x, d_y)):
         raise ValueError(f"antenna {index} has a value that is not a finite number: {antenna}")

@@ -1,7 +1,7 @@
 """Beam intensity of phased antenna arrays, and the beam that serves a user best.
 
-Source: the paper's appendix "6G Beam forming and RL environment", the equation of the final intensity and
-that of the codebook's angles, with the differences of the released code. An array of N_s = 17 senders along
+Source: the paper's appendix "6G Beam forming and RL environment", the equations of the final intensity and
+of the codebook's angles, with the differences of the released code. An array of N_s = 17 senders along
 the unit vector d, tuned to the phase gradient phi, has at the offset (dx, dy) from its center the intensity
 
     I = sin^2(N_s xi / 2) / (N_s^2 R^p sin^2(xi / 2)),   xi = u - phi,   u = pi (dx d_x + dy d_y) / R,

@@ -18,7 +18,7 @@ import numpy as np
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna
 
 SEED = 2025
-"""The seed of all placements; that of one is (SEED, antennas, index)."""
+"""The seed of all placements; a placement's seed is (SEED, antennas, index)."""
 DISTANCE = 1.5
 """Pairs of antennas stand further apart than this."""
 COUNTS = (2, 3, 4, 5)

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e0cc00", "#000000", "#56b4e9", "#e69f00")
-"""Colors of the antennas, in their order: those of Okabe and Ito for the color-blind, with a darker yellow."""
+"""Colors of the antennas, in their order: Okabe and Ito's for the color-blind, with a darker yellow."""
 _DARK = ("#0072b2", "#d55e00", "#009e73", "#000000")
-"""Those that white writing can be read on."""
+"""Colors on which white text can be read."""
 _INK = "#202428"
 _FAINT, _STRONG = 10**-4.5, 10**-0.5
 """Intensities drawn in the palest and in the fullest color."""
@@ -43,7 +43,7 @@ class Moment:
     step:
         The step that the user is at.
     antenna, beam, intensity:
-        Which antenna serves, with which beam, at what intensity.
+        The serving antenna, its beam, and the intensity.
     best:
         The antenna that would be best.
     received:
@@ -60,7 +60,7 @@ class Moment:
 
 
 class GroundTruth(NamedTuple):
-    """What is best at every place of a grid over the field.
+    """The best antenna and beam at every place of a grid over the field.
 
     All (resolution, resolution), rows from y = 0 up, columns from x = 0 right, at the centers of the cells.
     """
@@ -70,7 +70,7 @@ class GroundTruth(NamedTuple):
     beam: NDArray[np.int8]
     """Index of that antenna's best beam in the codebook, the first of equals."""
     intensity: FloatArray
-    """The intensity of both, in [0, 1]: what an agent that knew the user's position would receive."""
+    """The intensity of both, in [0, 1], which an agent would receive if it knew the user's position."""
 
 
 def ground_truth(options: BeamOptions, resolution: int = 300) -> GroundTruth:
@@ -99,7 +99,7 @@ def ground_truth_figure(options: BeamOptions, resolution: int = 500) -> Figure:
     Parameters
     ----------
     options:
-        Options of the environment: antennas and physics are what matters here.
+        Options of the environment, of which antennas and physics matter here.
     resolution:
         Places along each side at which the best antenna is sought.
 

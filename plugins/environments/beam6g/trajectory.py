@@ -103,7 +103,7 @@ def spline(points: int) -> Spline:
 
 
 def inside(support: FloatArray, rejection: Rejection = "tolerant") -> NDArray[np.bool_]:
-    """Tell which candidates (B, n, 2) give a path that stays in the field: (B,).
+    """Return whether candidates (B, n, 2) give a path that stays in the field: (B,).
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def inside(support: FloatArray, rejection: Rejection = "tolerant") -> NDArray[np
         "tolerant": none of 1000 evenly spaced points leaves the field by more than 1e-9. "released": in
         addition, as the released code does by comparing without tolerance, reject a path whose
         `scipy.interpolate.UnivariateSpline` for x is below 0 at its first point, where it should be 0; at
-        degree 3 this rejects about a fifth of the valid paths, those that lean right.
+        degree 3 this rejects about a fifth of the valid paths: paths that lean right.
     """
     from qrlsuite.plugins.environments.beam6g import compiled
 
@@ -176,7 +176,7 @@ def sample(
 
 
 def require_inside(owner: str, support: FloatArray) -> None:
-    """Refuse saved support points (B, n, 2) that are none of the field; `owner` is the environment's name."""
+    """Refuse saved support points (B, n, 2) outside the field; `owner` is the environment's name."""
     if not ((support >= 0.0) & (support <= FIELD)).all():
         raise StoreError(f"{owner}: 'support_points' must lie in the field, 0..{FIELD:g}")
 

@@ -155,7 +155,7 @@ class BeamLanes(LaneEnv):
         return self._support.copy()
 
     def tabulate(self) -> Tables:
-        """Return the tables of all lanes, those of newly begun episodes computed now."""
+        """Return the tables of all lanes; tables of newly begun episodes are computed now."""
         if self._support is None:
             raise ResetNeeded("call reset() before tabulate()")
         if self._tables is None:

@@ -83,8 +83,8 @@ class Channel(Drawn):
 
     ## Rewards
 
-    With p the probability of a channel by Bayes' rule, after what was measured: an experiment earns by how much the
-    highest p rises; a name earns its p less the highest, and an end without a name 0 less the highest. So a return is
+    With p the probability of a channel by Bayes' rule, after all measurements: an experiment earns the rise of the
+    highest p; a name earns its p less the highest, and an end without a name 0 less the highest. So a return is
     the probability that the name is right, less 1/5.
 
     ## Episode End
@@ -113,12 +113,12 @@ class Channel(Drawn):
         )
 
     def moment(self) -> FloatArray:
-        """Return the probability of each channel after what was measured, (5,)."""
+        """Return the probability of each channel after all measurements, (5,)."""
         believed: FloatArray = self.lanes.believed[0].copy()
         return believed
 
     def figure(self) -> Figure:
-        """Return what was measured, and how probable each channel is by that."""
+        """Return a figure of the measurements, and the probability of each channel by them."""
         lanes = self.lanes
         named = int(lanes.named[0])
         return pictures.channel(
@@ -219,8 +219,8 @@ class ChannelLanes(EpisodeLanes):
 class Informative:
     """The reference policy that makes the experiment from which most is learned, and then names the likeliest channel.
 
-    What is learned is the mutual information of outcome and channel, after what was measured: greedy, one step ahead.
-    The name is the best one that this data allows; whether other experiments would be better still is not known.
+    The information is the mutual information of outcome and channel, after all measurements: greedy, one step ahead.
+    The name is the best one for this data; whether other experiments would be better still is unknown.
     """
 
     def __init__(self, envs: LaneEnv) -> None:
@@ -245,7 +245,7 @@ class Informative:
 
 
 class InTurn(Informative):
-    """The reference policy that makes the experiments in turn, and at last names what is most probable."""
+    """The reference policy that makes the experiments in turn, and at last names the most probable channel."""
 
     def experiments(self, believed: FloatArray) -> IntArray:
         """Return an experiment for each lane."""

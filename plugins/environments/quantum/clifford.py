@@ -85,13 +85,13 @@ class Clifford(Drawn):
 
     ## Description
 
-    A Clifford operation maps Pauli words to Pauli words. But for signs, it is a symplectic matrix of bits: row k is the
-    image of X_k, row n + k that of Z_k. Signs are corrected by Pauli gates, which are free here, and a global phase has
-    no place in it. The target of an episode is a product of random gates: their number is uniform in 1 .. `scramble`,
+    A Clifford operation maps Pauli words to Pauli words. Up to signs, it is a symplectic matrix of bits: row k is the
+    image of X_k, row n + k the image of Z_k. Signs are corrected by Pauli gates, which are free here; a global phase
+    does not appear. The target of an episode is a product of random gates: their number is uniform in 1 .. `scramble`,
     each is drawn uniformly; where the product is the identity, a last gate is drawn again.
 
-    What is seen is what remains to be written: the gates so far, undone, and then the target. When that is the
-    identity, the gates in their order are a circuit for the target. There are 720 such matrices of two qubits,
+    The agent sees the remaining operation: the gates so far, undone, and then the target. When it is the identity,
+    the gates in their order are a circuit for the target. There are 720 such matrices of two qubits,
     1,451,520 of three and 47,377,612,800 of four. For two and three all shortest circuits are known by exhaustion (the
     policy `shortest circuit`), for four no optimum is. Every target has a circuit of `scramble` gates or fewer.
 
@@ -145,12 +145,12 @@ class Clifford(Drawn):
         )
 
     def moment(self) -> IntArray:
-        """Return what remains to be done, (2n, 2n) bits."""
+        """Return the remaining operation, (2n, 2n) bits."""
         left: IntArray = self.lanes.left[0].copy()
         return left
 
     def figure(self) -> Figure:
-        """Return the circuit so far and what remains."""
+        """Return a figure of the circuit so far and the remaining operation."""
         options = self.lanes.options
         circuit = [self.lanes.gates[int(action)] for action in self.done]
         return pictures.clifford(circuit, self.shown[-1], options.qubits, options.steps)
@@ -169,7 +169,7 @@ class CliffordLanes(EpisodeLanes):
     Attributes
     ----------
     left:
-        What remains to be done, (L, 2n, 2n) int64, bits.
+        The remaining operation, (L, 2n, 2n) int64, bits.
     """
 
     name = "clifford"
@@ -285,7 +285,7 @@ class ShortestCircuit:
 
 
 class GreedyCircuit:
-    """The reference policy that takes the gate after which fewest bits differ from the identity, the first of these."""
+    """The reference policy that takes the first gate after which fewest bits differ from the identity."""
 
     def __init__(self, envs: LaneEnv) -> None:
         self.envs = _lanes(envs)

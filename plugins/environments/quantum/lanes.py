@@ -1,4 +1,4 @@
-"""What the quantum tasks share: Pauli matrices, and one lane that is drawn."""
+"""Common parts of the quantum tasks: Pauli matrices, and one lane that is drawn."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def pauli(word: str) -> ComplexArray:
 
 
 def words(qubits: int) -> list[str]:
-    """Return all Pauli words of `qubits` qubits but that of identities, in alphabetical order."""
+    """Return all Pauli words of `qubits` qubits except the identity, in alphabetical order."""
     return ["".join(each) for each in product("IXYZ", repeat=qubits)][1:]
 
 
 class Drawn(OneLane):
-    """One lane that remembers what was done in this episode, and draws it with matplotlib."""
+    """One lane that remembers the actions of this episode, and draws them with matplotlib."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}
 
@@ -48,10 +48,10 @@ class Drawn(OneLane):
         self.done: list[Any] = []
         """The episode's actions."""
         self.shown: list[Any] = []
-        """What `moment` returned after the reset and after every step."""
+        """Results of `moment` after the reset and after every step."""
 
     def moment(self) -> Any:
-        """Return what the picture needs of this moment."""
+        """Return data of this moment for the picture."""
         raise NotImplementedError
 
     def figure(self) -> Figure:

@@ -125,7 +125,7 @@ def circuit(axes: Axes, gates: Sequence[tuple[str, tuple[int, ...]]], qubits: in
 def clifford(
     gates: Sequence[tuple[str, tuple[int, ...]]], left: NDArray[np.int64], qubits: int, steps: int
 ) -> Figure:
-    """Draw a circuit, and the matrix that remains beside it; the identity is what it should be."""
+    """Draw a circuit, and beside it the remaining matrix, which should become the identity."""
     drawn = figure(2.2 + 0.3 * steps, 0.9 + 0.45 * qubits)
     wide, narrow = drawn.subplots(1, 2, width_ratios=(0.3 * steps, 1.8))
     circuit(wide, gates, qubits, steps)

@@ -77,7 +77,7 @@ class PulseOptions:
 
 
 def physics(options: PulseOptions) -> tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray]:
-    """Return drift (d, d), controls (qubits, d, d), the target (d,), and what coherence keeps in half a step (d, d)."""
+    """Return drift (d, d), controls (qubits, d, d), target (d,), and the factor of dephasing in half a step (d, d)."""
     one = options.qubits == 1
     drift = pauli("X") / 2 if one else (pauli("XI") + pauli("IX") + options.coupling * pauli("ZZ")) / 2
     controls = np.stack([options.strength * pauli(w) / 2 for w in (["Z"] if one else ["ZI", "IZ"])])
@@ -99,7 +99,7 @@ class Pulse(Drawn):
         H(u)      = (J u Z + X) / 2                                     (one qubit)
         H(u1, u2) = (J u1 Z1 + J u2 Z2 + X1 + X2 + c Z1 Z2) / 2         (two qubits)
 
-    The first, J = 4, T = 2 pi, 20 steps and the target |1> are those of Zhang et al., "When does reinforcement learning
+    The first, J = 4, T = 2 pi, 20 steps and the target |1> are from Zhang et al., "When does reinforcement learning
     stand out in quantum control?" (arXiv 1902.02157), in the code at github.com/93xiaoming/RL_state_preparation. Two
     qubits, their target (|00> + |11>) / sqrt(2) and random starts are ours.
 
@@ -221,7 +221,7 @@ class PulseLanes(EpisodeLanes):
         self.drift, self.controls, self.target, self.kept = physics(options)
         self.words = words(n)
         self.levels = np.array(list(product([0.0, 1.0], repeat=n)))
-        """(2^qubits, qubits): what the fields are at each discrete action."""
+        """(2^qubits, qubits): the fields of each discrete action."""
         self._transposed = np.stack([pauli(word).T for word in self.words])
         self._rho = np.zeros((num_envs, 2**n, 2**n, 2))
         """Density matrices, real and imaginary parts."""
@@ -328,7 +328,7 @@ def _lanes(envs: LaneEnv) -> PulseLanes:
 
 
 class GreedyPulse:
-    """The reference policy that takes what has the highest fidelity after the step, of 2 or 11 strengths a field."""
+    """The reference policy that takes the strength (of 2 or 11 a field) with the highest fidelity after the step."""
 
     def __init__(self, envs: LaneEnv) -> None:
         self.envs = _lanes(envs)

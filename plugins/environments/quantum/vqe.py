@@ -68,7 +68,7 @@ class VQEOptions:
 
 @cache
 def hamiltonians(options: VQEOptions) -> tuple[FloatArray, FloatArray]:
-    """Return what episodes are drawn from: distances or fields (K,), and Hamiltonians (K, d, d), real."""
+    """Return the problems that episodes draw from: distances or fields (K,), and Hamiltonians (K, d, d), real."""
     n = options.qubits
     if options.model == "h2":
         terms = np.stack([pauli(word).real for word in ("II", "ZI", "IZ", "ZZ", "XX", "YY")])
@@ -115,10 +115,10 @@ class VQE(Drawn):
     | `ising` | - sum Z_i Z_i+1 - g sum X_i, an open chain, g = 0.5, 0.6, ..., 1.5           | the coupling      |
 
     The coefficients of `h2`, the molecule in the minimal basis STO-3G at 12 distances of 0.40 to 2.85 Angstrom, are
-    those of O'Malley et al., "Scalable quantum simulation of molecular energies" (arXiv 1512.06860), as the samples of
-    Microsoft's Quantum Development Kit hold them.
+    from O'Malley et al., "Scalable quantum simulation of molecular energies" (arXiv 1512.06860), by the samples of
+    Microsoft's Quantum Development Kit.
 
-    With E the energy at the end, E_0 that of the ground state (dense diagonalization) and E_1 the lowest of circuits
+    With E the energy at the end, E_0 the ground state's (dense diagonalization) and E_1 the lowest of circuits
     without CX, the score is (E_1 - E) / (E_1 - E_0), and 0 where that is negative: the part of the correlation energy.
 
     ## Action Space
@@ -163,7 +163,7 @@ class VQE(Drawn):
         )
 
     def moment(self) -> float:
-        """Return the energy above that of the ground state."""
+        """Return the energy above the ground state's."""
         return float(self.lanes.above()[0])
 
     def figure(self) -> Figure:
@@ -225,7 +225,7 @@ class VQELanes(EpisodeLanes):
         return angles, reached
 
     def above(self) -> FloatArray:
-        """Return the energies above those of the ground states, (L,)."""
+        """Return the energies above the ground states' energies, (L,)."""
         result: FloatArray = self.energy - self.exact[self.which]
         return result
 
@@ -326,7 +326,7 @@ class BestCircuit:
 
 @cache
 def _searched(options: VQEOptions) -> IntArray:
-    """Return the best circuits that are known, (K, steps)."""
+    """Return the best known circuits, (K, steps)."""
     envs = VQELanes(options, 1)
     plan = []
     for k in range(len(envs.values)):
