@@ -116,7 +116,7 @@ def pair(row: Row, match: re.Match[str]) -> Row:
     """Return the row of a pair of entries."""
     task, first, second = match["task"], match["first"], match["second"]
     board = board_of(match["study"], task)
-    cells = api.compare(first, second, task=task, published=True, runs="none")
+    cells = api.compare(load(first, task), load(second, task))
     entries = {each.entry.label: each.entry for each in board.rows}
     i, j = (board.order[list(entries).index(label)] for label in (first, second))
     change = f"steps below threshold {percent(board.board.difference[i, j])}"
@@ -310,7 +310,7 @@ def against(count: int) -> tuple[list[int], list[str], Counter[Verdict]]:
         change = percent(board.mean[circuit] / board.mean[network] - 1)
         texts.append(f"{change} ({word}, p {board.adjusted[circuit, network]:.4f})")
         for task in tasks:
-            cells = api.compare(f"ddqn {MODELS[3]}", f"ddqn {model}", task=task, published=True, runs="none")
+            cells = api.compare(load(f"ddqn {MODELS[3]}", task), load(f"ddqn {model}", task))
             verdicts.update(each for line in cells.verdicts for each in line)
     return signs, texts, verdicts
 
@@ -425,7 +425,7 @@ def five_runs() -> tuple[str, ...]:
 def cut() -> tuple[str, ...]:
     """The cells of CartPole at epsilon 0.05."""
     first, second = "reinforce vqc-native qubits=4 layers=1", "reinforce mlp width=16 depth=1"
-    cells = api.compare(first, second, task="cartpole", published=True, runs="none").verdicts[0]
+    cells = api.compare(load(first, "cartpole"), load(second, "cartpole")).verdicts[0]
     won, lost = cells.count(Verdict.WIN), cells.count(Verdict.LOSS)
     assert won + lost < len(cells), (
         "every cell is significant: the statement about epsilon 0.05 does not hold"

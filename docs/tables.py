@@ -176,7 +176,7 @@ def pairs(task: str) -> Rows:
     for question, asked in PAIRS[task]:
         for place, (first, second) in enumerate(asked):
             one, two = rows[first], rows[second]
-            compared = api.compare(one["label"], two["label"], task=task, published=True, runs="none")
+            compared = api.compare(load(one["label"], task), load(two["label"], task))
             times = compared.as_dict()["times"]
             p = facts["times"]["adjusted_p"][order.index(one["entry"])][order.index(two["entry"])]
             own = second.startswith(first)

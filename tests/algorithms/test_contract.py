@@ -99,18 +99,6 @@ def assert_same(
 
 
 @every_algorithm
-@pytest.mark.parametrize("model", ["mlp", "vqc-native"])
-def test_a_seed_does_not_depend_on_its_company(name: str, case: dict[str, Any], model: str) -> None:
-    size = 19 if model == "mlp" else 5
-    whole = trained(name, range(size), case, model=model)
-    groups: list[list[int]] = [[0], [size - 1], [1, 2], [4, 1, 3]]
-    if model == "mlp":
-        groups += [[17, 18], list(range(2, 13)), list(range(18, 0, -1))]
-    for members in groups:
-        assert_same(trained(name, members, case, model=model), members, whole)
-
-
-@every_algorithm
 def test_a_hundred_seeds_do_not_change_one(name: str, case: dict[str, Any]) -> None:
     """Wide layers, whose products are computed by another library routine than narrow ones."""
     more: dict[str, Any] = {"model_options": {"width": 64, "depth": 2}}

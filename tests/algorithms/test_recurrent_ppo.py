@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,17 +9,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.options import parse_setting
 from qrlsuite.plugins.algorithms.ppo import PPO, _outputs
-from qrlsuite.results.store import EntryStore
 from qrlsuite.testing.group import Toy
 from qrlsuite.training.trainer import Trainer
-from tests.algorithms.test_contract import VARIANTS, assert_same, trained
 from tests.algorithms.test_drqn import LANES
 from tests.algorithms.worlds import Contexts, Group, Perceptron, log_softmax
-from tests.conftest import results
 
 
 def made(model: str = "gru", seeds: int = 2, **settings: Any) -> PPO:
@@ -110,27 +104,6 @@ def test_what_comes_after_a_step_is_judged_by_what_is_remembered_there() -> None
     inside = ~(rollout.terminated | rollout.truncated)[:, :-1]
     expected = torch.from_numpy(rollout.rewards[:, :-1]).float() + 0.5 * values[:, 1:]
     torch.testing.assert_close(returns[:, :-1, :, 0][inside], expected[inside])
-
-
-@pytest.mark.parametrize("name", ["drqn", "ppo"])
-@pytest.mark.parametrize("model", ["gru", "lstm"])
-def test_a_seed_does_not_depend_on_its_company(name: str, model: str, tiny_task: str, tmp_path: Path) -> None:
-    """Alone, in pairs and shuffled; through the core also after a pause."""
-    case = {**VARIANTS[name][0], "length": 3}
-    whole = trained(name, range(5), case, model=model, model_options={"width": 7})
-    for members in ([0], [4], [4, 1, 3]):
-        part = trained(name, members, case, model=model, model_options={"width": 7})
-        assert_same(part, members, whole)
-    words = [f"algorithm.{key}={value}" for key, value in case.items()]
-    entry = resolve(tiny_task, model, name, [parse_setting(word) for word in ["width=7", *words]])
-    plans = {"together": [([0, 1, 2], 3)], "apart": [([1], 1), ([0, 2], 2), ([1], 2), ([2, 1, 0], 3)]}
-    stores = []
-    for folder, stages in plans.items():
-        stores.append(EntryStore.create(tmp_path / folder, entry).path)
-        for seeds, epochs in stages:
-            train_group(stores[-1], seeds, epochs)
-    for seed in range(3):
-        assert results(stores[0], seed) == results(stores[1], seed)
 
 
 @pytest.mark.parametrize(("model", "solves"), [("gru", True), ("mlp", False)])

@@ -220,14 +220,6 @@ def test_references_that_do_not_resolve(reference: str, message: str) -> None:
         specs.resolve(reference)
 
 
-@pytest.mark.parametrize("spec", [each.spec for each in registry.load()], ids=lambda spec: spec.title)
-def test_every_registered_reference_resolves(spec: specs.Spec) -> None:
-    for field in ("options", "build", "factory", "population", "vector", "entry_point"):
-        reference = getattr(spec, field, None)
-        if reference is not None:
-            assert callable(specs.resolve(reference))
-
-
 def test_names_stay_what_they_are_once_every_module_is_imported() -> None:
     """A function of the same name as a submodule would be replaced by it, and be no function any longer."""
     for name in sorted(ALL):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import types
 from collections.abc import Callable
@@ -22,8 +21,6 @@ from qrlsuite.results.checkpoint import group_id
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import ModelSpec
-from qrlsuite.testing import model as rules
-from qrlsuite.testing.common import Subject
 from qrlsuite.training import unregistered
 from tests.conftest import Train, results
 
@@ -250,14 +247,6 @@ def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: 
         train(name, seeds, model="acme", settings=()) for name, seeds in (("a", (0, 1)), ("b", (1,)))
     )
     assert results(together, 1) == results(alone, 1)
-
-
-@pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
-def test_check_names_attribute_and_cure(cls: type[Base], install: Callable[[type[Base]], ModelSpec]) -> None:
-    findings = rules.check(Subject(install(cls), None, (), {}))
-    (broken,) = [finding for finding in findings if finding.rule == "nothing unregistered"]
-    assert not broken.ok
-    assert re.search(REFUSED[cls], broken.message), broken.message
 
 
 def test_a_model_that_cannot_be_vmapped_is_said_once(install: Callable[..., Any], train: Train) -> None:

@@ -18,6 +18,7 @@ from tests.statistics.conftest import SURFACE
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "leaderboard.md").read_text()
+LOAD = load("statements").load
 BOARD = PAGE.partition("\n## The published board\n")[2].partition("\n## ")[0]
 
 
@@ -34,9 +35,7 @@ def test_the_decided_pairs_are_the_boards() -> None:
     order = [labels[row["entry"]] for row in times["entries"]]
     pairs = times["adjusted_p"][order.index("mlp width=16 lr=0.002")]
     p = [f"{pairs[order.index(f'vqc-native qubits={n}')]:.3f}".removeprefix("0") for n in (10, 8)]
-    compared = api.compare(
-        "vqc-native qubits=10", "mlp width=16 lr=0.002", task="beam6g", published=True, runs="none"
-    )
+    compared = api.compare(LOAD("vqc-native qubits=10", "beam6g"), LOAD("mlp width=16 lr=0.002", "beam6g"))
     cells = f"{compared.count(Verdict.WIN)} of {sum(len(line) for line in compared.verdicts)}"
     text = PAGE.replace("\n", " ")
     assert f"{times['decided']} of {times['pairs']} pairs are decided." in text
@@ -61,7 +60,7 @@ def test_the_core_hours_are_the_boards() -> None:
     ],
 )
 def test_the_cells_of_the_retuned_network(first: str, second: str, sentence: str) -> None:
-    comparison = api.compare(first, second, task="beam6g", published=True)
+    comparison = api.compare(LOAD(first, "beam6g"), LOAD(second, "beam6g"))
     assert comparison.count(Verdict.LOSS) == 0
     assert sentence.format(comparison.count(Verdict.WIN)) in BOARD.replace("\n", " ")
 
@@ -119,7 +118,7 @@ def test_what_the_board_of_three_spins_says() -> None:
         return str(found)
 
     sines, width = called("mlp width=5 activation=sin "), called("mlp width=5 input_scale")
-    said = api.compare(sines, width, task="vqe-ising", published=True, runs="none").verdict
+    said = api.compare(LOAD(sines, "vqe-ising"), LOAD(width, "vqe-ising")).verdict
     assert "needs 33% fewer steps" in said
     assert "(27% to 38%, 50 seeds each" in said
     assert "with sines it needs 33% fewer steps (27% to 38%)" in text

@@ -87,15 +87,6 @@ for name, (task, model) in cases.items():
 """
 """Does for all of them, one after the other in one process, what a group and its probe do."""
 
-RULES = """
-import json, sys
-from qrlsuite import testing
-broken = {}
-for kind, name in json.loads(sys.argv[1]):
-    broken[name] = [finding.rule for finding in testing.check(kind, name) if not finding.ok]
-print("\\n" + json.dumps(broken))
-"""
-
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -149,20 +140,3 @@ def test_what_run_says(name: str, verdicts: dict[str, str | None]) -> None:
         assert re.match(r"'\w+' of epoch \d|the state '[\w.]+' after epoch \d", said or ""), said
     elif expected is not None:
         assert re.search(expected, said or ""), said
-
-
-@pytest.mark.long
-def test_what_check_says(site: Path) -> None:
-    named = [("model", name) for name in MODELS] + [("environment", name) for name in ENVIRONMENTS]
-    words = [sys.executable, "-W", "ignore", "-c", RULES, json.dumps(named)]
-    done = subprocess.run(
-        words, env=installed(site), capture_output=True, text=True, check=False, timeout=HANGS
-    )
-    assert done.returncode == 0, done.stderr
-    broken = json.loads(done.stdout.splitlines()[-1])
-    missed = {
-        name: broken[name]
-        for name, (_, rules) in {**MODELS, **ENVIRONMENTS}.items()
-        if not rules <= set(broken[name]) or (broken[name] and not rules)
-    }
-    assert missed == {}

@@ -93,25 +93,6 @@ def test_gymnasium_step_for_step_from_given_states() -> None:
     assert episodes > 3
 
 
-@pytest.mark.parametrize("normalization", ["none", "bounds", "arctan"])
-@pytest.mark.parametrize(("offset", "size"), [(0, 1), (3, 7), (13, 33), (64, 65), (127, 2)])
-def test_a_lane_does_not_depend_on_its_position_or_on_the_number_of_lanes(
-    offset: int, size: int, normalization: str
-) -> None:
-    total = 129
-    actions = np.random.default_rng(1).integers(0, 2, (60, total))
-    part = slice(offset, offset + size)
-    together = lanes(total, normalization=normalization)
-    apart = CartPoleLanes(parse({"normalization": normalization}), size)
-    apart.seed_lanes([np.random.default_rng(g) for g in range(offset, offset + size)])
-    np.testing.assert_array_equal(together.reset()[0][part], apart.reset()[0])
-    for row in actions:
-        whole, some = together.step(row), apart.step(row[part])
-        np.testing.assert_array_equal(whole[0][part], some[0])
-        np.testing.assert_array_equal(whole[2][part], some[2])
-        np.testing.assert_array_equal(together.state[:, part], apart.state)
-
-
 def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
     env = lanes(6, streams=2)
     observations, _ = env.reset()

@@ -31,14 +31,6 @@ def lanes(name: str, count: int = 2) -> LaneEnv:
 
 
 @all_lanes
-def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(name: str) -> None:
-    first, again, other = (MADE[name](4).reset(seed=seed)[0] for seed in (5, 5, 6))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
-    assert len(np.unique(first, axis=0)) > 1
-
-
-@all_lanes
 def test_observations_and_states_are_copies(name: str) -> None:
     env = lanes(name)
     given: dict[str, np.ndarray[Any, Any]] = {"first": env.reset()[0], **env.state_dict()}

@@ -79,55 +79,6 @@ def test_initial_parameters_come_from_the_generator_and_lie_in_their_ranges():
     assert torch.equal(agents(1, small(ansatz="skolik"))[0].circuit["scaling"], torch.ones(2, 3))
 
 
-SHAPES = [(3, 3, 64, "float32"), (3, 3, 64, "float64"), (4, 1, 7, "float32"), (5, 3, 1, "float64")]
-WIDE = (16, 3, 1, "float32")  # wide enough for batched matrix products
-
-
-@pytest.mark.parametrize(
-    ("backend", "qubits", "out", "batch", "dtype"),
-    [
-        (backend, *shape)
-        for backend in BACKENDS
-        for shape in (SHAPES if backend == "pennylane" else [*SHAPES, WIDE])
-    ],
-)
-def test_an_agent_has_the_same_bits_alone_and_anywhere_in_a_population(backend, qubits, out, batch, dtype):
-    count = 2 if qubits == 16 else 5
-    given = small(backend, qubits=qubits, layers=1, dtype=dtype)
-    modules = agents(count, given, out=out)
-    together = vqc.population(modules, given)
-    x, cotangent = observations(count, batch, 3), observations(count, batch, out)
-    values = together(x)
-    values.backward(cotangent)
-    assert values.shape == (count, batch, out)
-    assert values.dtype == torch.float32
-    for s, module in enumerate(modules):
-        alone = vqc.population([module], given)
-        for single, got in ((alone, alone(x[s : s + 1])[0]), (module, module(x[s]))):
-            assert torch.equal(got, values[s])
-            single.zero_grad()
-            got.backward(cotangent[s])
-            for name, parameter in single.named_parameters():
-                mine = together.get_parameter(name).grad[s]
-                assert torch.equal(parameter.grad.reshape(mine.shape), mine), name
-
-
-def test_many_agents_at_odd_offsets_have_the_bits_of_one():
-    given = small(qubits=6, layers=1)
-    modules = agents(17, given)
-    x, cotangent = observations(17, 64, 3), observations(17, 64, 3)
-
-    def gradients(some):
-        together = vqc.population([modules[s] for s in some], given)
-        values = together(x[some])
-        values.backward(cotangent[some])
-        return [values.detach(), *[p.grad for p in together.parameters()]]
-
-    everyone = gradients(list(range(17)))
-    for some in ([3], [16, 5, 9], list(range(1, 17))):
-        assert all(torch.equal(a, b[some]) for a, b in zip(gradients(some), everyone))
-
-
 def test_deep_copies_are_independent_but_share_the_counter():
     together = vqc.population(agents(2, small()), small())
     target = copy.deepcopy(together)
