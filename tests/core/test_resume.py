@@ -4,29 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import signal
 import time
-from pathlib import Path
 
 import pytest
 
 from qrlsuite.results import checkpoint
-from qrlsuite.results.claims import claims
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training import group
 from qrlsuite.training.interrupts import Interruptible
 from qrlsuite.training.trainer import Trainer
-from tests.commands import Command, start_worker
-from tests.conftest import HANGS, Train, most_epochs, results
+from tests.commands import start_worker
+from tests.conftest import HANGS, Train, results
 
 EPOCHS = 6
-
-
-@pytest.fixture
-def frequent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checkpoint after every epoch."""
-    monkeypatch.setattr(group, "CHECKPOINT_SECONDS", 0.0)
 
 
 def _interrupt_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
@@ -60,19 +50,6 @@ def test_interrupted_and_resumed_equals_undisturbed(
         assert results(straight, seed) == results(stopped, seed)
 
 
-def test_groups_are_split_and_merged_on_resume(
-    train: Train, monkeypatch: pytest.MonkeyPatch, frequent: None
-) -> None:
-    straight = train("straight", [0, 1, 2, 3], EPOCHS)
-    train("mixed", [0, 1, 2], 2)
-    train("mixed", [3], 2)
-    train("mixed", [1, 3], 4)
-    train("mixed", [0, 2], 4)
-    mixed = train("mixed", [0, 1, 2, 3], EPOCHS)
-    for seed in range(4):
-        assert results(straight, seed) == results(mixed, seed)
-
-
 def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
     train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,33 +65,6 @@ def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
     )
     torn = train("torn", [0], EPOCHS)
     assert results(straight, 0) == results(torn, 0)
-
-
-@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.long)])
-def test_sigkill_at_random_moments(kills: int, train: Train) -> None:
-    """A worker process is killed again and again; the final bytes are those of an undisturbed run."""
-    entry = train("killed", [0, 1, 2], 1)  # one epoch, so that the folder and its entry exist
-    words = (str(entry), "--seeds", "0:3", "--epochs")
-    env = {**os.environ, "QRLSUITE_CHECKPOINT_SECONDS": "0"}
-    dice = random.Random(1)
-    for _ in range(kills):
-        process = start_worker(*words, "1000000", env=env)
-        _wait_for_claim(entry, process)
-        time.sleep(dice.uniform(0.0, 0.3))
-        os.kill(process.pid, signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL
-    epochs = 1 + most_epochs(entry)
-    assert start_worker(*words, str(epochs), env=env).wait() == 0
-    straight = train("straight", [0, 1, 2], epochs)
-    for seed in range(3):
-        assert results(straight, seed) == results(entry, seed)
-        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, epochs + 1))
-
-
-def _wait_for_claim(entry: Path, process: Command) -> None:
-    while not any(claim.pid == process.pid for claim in claims(EntryStore(entry))):
-        assert process.poll() is None
-        time.sleep(0.02)
 
 
 def test_sigterm_saves_and_exits_130(train: Train) -> None:

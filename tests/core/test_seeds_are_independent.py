@@ -1,4 +1,4 @@
-"""Training seeds together gives each the same result as training it alone: bitwise, in any group and order."""
+"""What a seed draws and does depends neither on its company nor on the simulator of its circuit."""
 
 from __future__ import annotations
 
@@ -8,30 +8,6 @@ import pytest
 
 from qrlsuite.results.store import EntryStore
 from tests.conftest import POLE, Train, results
-
-MODELS = {
-    "mlp": (3, ("width=16",)),
-    "vqc-pennylane": (1, ("qubits=2", "layers=1")),
-    "vqc-native": (3, ("qubits=3", "layers=2")),
-}
-"""Epochs and options; PennyLane is slow."""
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_seeds_trained_together_equal_seeds_trained_apart(model: str, train: Train) -> None:
-    epochs, settings = MODELS[model]
-    together = train("together", [0, 1, 2, 3], epochs, model=model, settings=settings)
-    first = train("apart", [0, 1], epochs, model=model, settings=settings)
-    second = train("apart", [2, 3], epochs, model=model, settings=settings)
-    alone = train("alone", [2], epochs, model=model, settings=settings)
-    shuffled = train("shuffled", [3, 2, 0], epochs, model=model, settings=settings)
-    assert first == second
-    for seed in range(4):
-        assert results(together, seed) == results(first, seed), f"seed {seed} depends on its company"
-    assert results(together, 2) == results(alone, 2)
-    assert len({results(together, seed) for seed in range(4)}) == 4
-    for seed in (0, 2, 3):
-        assert results(together, seed) == results(shuffled, seed)
 
 
 def test_shots_do_not_depend_on_when_others_end_their_episodes(tiny_task: str, train: Train) -> None:

@@ -187,23 +187,6 @@ def test_a_constant_value_becomes_zero() -> None:
 
 
 @agents
-def test_seeds_trained_together_equal_seeds_trained_apart(
-    algorithm: str, model: str, settings: tuple[str, ...], train: Train
-) -> None:
-    agent = (algorithm, model, settings)
-    together = train("together", [0, 1, 2, 3], agent)
-    apart = train("apart", [0, 1], agent)
-    train("apart", [2, 3], agent)
-    alone = train("alone", [2], agent)
-    shuffled = train("shuffled", [3, 0], agent)
-    for seed in range(4):
-        assert results(together, seed) == results(apart, seed), f"seed {seed} depends on its company"
-    assert results(together, 2) == results(alone, 2)
-    assert results(together, 0) == results(shuffled, 0)
-    assert len({results(together, seed)[1] for seed in range(4)}) == 4
-
-
-@agents
 def test_interrupted_split_and_resumed_equals_undisturbed(
     algorithm: str, model: str, settings: tuple[str, ...], train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:

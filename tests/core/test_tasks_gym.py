@@ -231,24 +231,6 @@ def train(entry: Entry, folder: Path, seeds: list[int], epochs: int = 4) -> Entr
     return store
 
 
-def test_seeds_together_and_apart_and_resumed(
-    stranger: Callable[..., Entry], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Episodes of different lengths, cut by epochs' ends: the same bytes however seeds are grouped."""
-    monkeypatch.setattr(group, "CHECKPOINT_SECONDS", 0.0)
-    entry = stranger()
-    together = train(entry, tmp_path / "together", [0, 1])
-    mixed = tmp_path / "mixed"
-    train(entry, mixed, [1], 2)
-    train(entry, mixed, [0], 2)
-    train(entry, mixed, [1, 0], 3)
-    apart = train(entry, mixed, [0], 4)
-    train(entry, mixed, [1], 4)
-    for seed in (0, 1):
-        assert results(together.path, seed) == results(apart.path, seed)
-    assert results(together.path, 0) != results(together.path, 1)
-
-
 def test_scores_are_the_environments_or_returns(stranger: Callable[..., Entry], tmp_path: Path) -> None:
     scores = train(stranger(source="info"), tmp_path / "info", [0]).seed(0).epochs()[-1]["scores"]
     steps = np.array(scores) * 12
