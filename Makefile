@@ -25,7 +25,7 @@ test: install-dev
 ATEN ?= default
 NUMBA ?= generic
 VECTORS ?= tests/circuits/test_native.py tests/core/test_layers.py tests/core/test_population.py \
-  tests/core/test_earlier_versions.py tests/core/test_seeds_are_independent.py tests/testing/test_broken_models.py
+  tests/core/test_earlier_versions.py tests/testing/test_broken_models.py
 test-vectors: install-dev
 	ATEN_CPU_CAPABILITY=$(ATEN) NUMBA_CPU_NAME=$(NUMBA) NUMBA_CPU_FEATURES= $(BIN)/python -m pytest -q $(VECTORS)
 
