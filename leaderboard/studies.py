@@ -103,7 +103,7 @@ def find(name: str) -> Study:
 
 
 def read_outcome(name: str, runs: Path) -> StudyOutcome:
-    """Return what a study with looks has decided: in the results folder where it has begun, else as published."""
+    """Return the outcome of a study with looks: of the results folder if it has begun there, else the published one."""
     found, folder = find(name), published_studies.folder_of(name)
     if folder is not None and (folder == Path(name) or not has_begun(runs, found.name)):
         return published_studies.read(folder)

@@ -31,8 +31,8 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     limit truncates, and learners estimate what would have followed (`arrived`). Where an episode ends, the lane is
     reset in the same step; then infos hold, as Gymnasium's same-step mode does, `final_obs` (num_envs, ...) with mask
     `_final_obs`, and `final_info`, a dict that may hold `score` (num_envs,) with mask `_score`. Infos may hold
-    `action_mask` (num_envs, choices), 1 for each action that can be chosen next, those of several numbers one after
-    another; where a time limit ends an episode, `final_info` then holds that of the last observation.
+    `action_mask` (num_envs, choices), 1 for each allowed action, several numbers' choices one after another; where a
+    time limit ends an episode, `final_info` then holds the mask of the last observation.
 
     All randomness comes from `self.streams`: stream g serves the lanes `g*m .. (g+1)*m - 1`, m =
     num_envs / len(streams), in lane order, so that an episode never depends on lanes of another stream.
@@ -174,7 +174,7 @@ class EpisodeLanes(LaneEnv):
         raise NotImplementedError
 
     def _scores(self) -> NDArray[np.float64]:
-        """Return what each lane's episode is worth if it ends now, (L,) in [0, 1]."""
+        """Return the score of each lane's episode if it ends now, (L,) in [0, 1]."""
         raise NotImplementedError
 
     def _metrics(self) -> dict[str, NDArray[np.float64]]:

@@ -42,8 +42,8 @@ class GymLanes(LaneEnv):
     so discrete ones are one-hot, and the parts of a Dict or Tuple follow each other in its order. Actions have the
     shape and type of their space, see `qrlsuite.actions`. At an episode's end `infos["final_info"]` holds `score` (L,)
     where the environment's `info` does, and `metrics`, (L,) by name, where that is a dict of numbers. Where `info`
-    holds an `action_mask` (choices,), 1 for what can be chosen, `infos["action_mask"]` is that of the returned
-    observations (L, choices), and at an episode's end `infos["final_info"]` has that of the last one.
+    holds an `action_mask` (choices,), 1 for allowed choices, `infos["action_mask"]` has the masks of the returned
+    observations (L, choices), and at an episode's end `infos["final_info"]` the mask of the last one.
 
     Without autoreset, a lane whose episode has ended stays where it is: its steps return the last observation,
     reward 0, and neither termination nor truncation.

@@ -1,4 +1,4 @@
-"""Short forms of what a plugin by path registers: a function or class alone, its options taken from the signature.
+"""Short forms of registration for plugins by path: a function or class alone, its options taken from the signature.
 
     form                     signature                                          registered as
     a function               (qubits, layers, ...) -> Circuit                   ansatz

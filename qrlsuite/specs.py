@@ -165,9 +165,9 @@ class ModelSpec(NumericSpec):
     build:
         Reference to `build(obs_dim, out_dim, options, generator) -> torch.nn.Module`, an ordinary
         single-agent module (B, obs_dim) -> (B, out_dim), every random number drawn from `generator`
-        (a `torch.Generator`). A function with a parameter `space` is given the space of the observations before they
-        were flattened, such as that of an image, and one with a parameter `role` what the network is for, such as
-        `"critic"`: see `qrlsuite.algorithm.BuildModel`.
+        (a `torch.Generator`). A parameter `space` gets the space of the observations before they were flattened, such
+        as an image's, and a parameter `role` the purpose of the network, such as `"critic"`: see
+        `qrlsuite.algorithm.BuildModel`.
     population:
         Reference to `population(modules, options) -> torch.nn.Module`: S built modules as one that maps
         (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
@@ -403,5 +403,5 @@ def kind(word: str) -> type[Spec]:
 
 
 def title(kind: type[Spec], name: str) -> str:
-    """Return what a thing is called in messages: `circuit backend 'native'`."""
+    """Return a thing's name in messages: `circuit backend 'native'`."""
     return f"{kind.kind.replace('_', ' ')} '{name}'"

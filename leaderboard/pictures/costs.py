@@ -27,7 +27,7 @@ class CostsOptions:
 
     units: Annotated[
         list[Unit],
-        Field(min_length=1, description="what sample complexity is counted in, a panel each"),
+        Field(min_length=1, description="units of sample complexity, a panel each"),
     ] = Field(default_factory=lambda: list(AXES))
     epsilons: Annotated[
         list[float] | None,

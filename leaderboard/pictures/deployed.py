@@ -28,7 +28,7 @@ class Line(NamedTuple):
 class DeployedOptions:
     """Settings of the picture."""
 
-    axis: Annotated[str, Field(description="what the horizontal axis shows")] = ""
+    axis: Annotated[str, Field(description="quantity on the horizontal axis")] = ""
     title: Annotated[str, Field(description="a line above the picture")] = ""
     note: Annotated[str, Field(description="a line below it")] = ""
 

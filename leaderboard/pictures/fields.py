@@ -42,7 +42,7 @@ class FieldsOptions:
         list[str] | str | None,
         Field(description="one field or several, a line for each of their values; by default `model`"),
     ] = None
-    where: Annotated[str | None, Field(description="only what has these values: 'model=mlp layers=2'")] = None
+    where: Annotated[str | None, Field(description="only rows with these: 'model=mlp layers=2'")] = None
     horizon: Annotated[
         int | None,
         Field(ge=1, description="environment steps to which all entries are cut; by default the task's"),

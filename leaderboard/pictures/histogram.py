@@ -24,7 +24,7 @@ class HistogramOptions:
     """Settings of the histogram."""
 
     bins: Annotated[int, Field(ge=2, le=1000, description="bins over the common range")] = 50
-    quantity: Annotated[str, Field(description="what the horizontal axis shows")] = "sum over an episode"
+    quantity: Annotated[str, Field(description="quantity on the horizontal axis")] = "sum over an episode"
     title: Annotated[str, Field(description="a line above the picture")] = ""
     note: Annotated[str, Field(description="a line below it")] = ""
 

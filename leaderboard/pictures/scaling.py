@@ -29,7 +29,7 @@ class ScalingOptions:
     by: Annotated[
         list[str] | str | None,
         Field(
-            description="what counts as size: `parameters`, an option of the model such as `width`, or of the task, "
+            description="the size: `parameters`, an option of the model such as `width`, or of the task, "
             "such as `environment.degree` or `environment.antennas` (a list counts by its length); several make "
             "several panels; by default the options in which entries of one model differ"
         ),
@@ -190,7 +190,7 @@ def _draw_panel(
 
 
 def _handle(k: int, line: _Line) -> Line2D:
-    """Return what a legend shows of the line at a place."""
+    """Return the legend's handle of the line at a place."""
     look = style.style(k)
     return Line2D(
         [], [], color=look.color, ls=look.line, marker=look.marker, mec="white", label=style.plain(line.label)

@@ -59,7 +59,7 @@ def provisional(entry: EntryResults) -> bool:
 
 
 def label(entry: EntryResults) -> str:
-    """Return what a legend says of an entry: its label and its seeds."""
+    """Return an entry's text in a legend: its label and its seeds."""
     return f"{plain(entry.legend)}  ({seeds_text(entry)})"
 
 

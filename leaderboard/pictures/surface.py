@@ -28,10 +28,10 @@ class SurfaceOptions:
         ),
     ] = "map"
     epsilons: Annotated[
-        list[float] | None, Field(description="rows; by default those of the task's ranking grid")
+        list[float] | None, Field(description="rows; by default of the task's ranking grid")
     ] = None
     deltas: Annotated[
-        list[float] | None, Field(description="columns; by default those of the task's ranking grid")
+        list[float] | None, Field(description="columns; by default of the task's ranking grid")
     ] = None
     horizon: Annotated[
         int | None,

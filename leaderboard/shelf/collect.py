@@ -319,7 +319,7 @@ def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
 
 
 def _shown(copies: Sequence[EntryResults]) -> tuple[list[EntryResults], str]:
-    """Return what is shown of an entry's copies, see `united`; and own ones beside it that get less far."""
+    """Return the shown copies of an entry, see `united`; and shorter own copies beside them."""
     whole, problem = united(copies)
     shorter = [copy for copy in copies if copy.source == "runs" and _weight(copy)[0] < _weight(whole)[0]]
     return [*shorter, whole.marked(BESIDE) if shorter else whole], problem

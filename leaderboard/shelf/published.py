@@ -143,7 +143,7 @@ class PublishedEntry:
         return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
 
     def entry_results(self) -> EntryResults:
-        """Return what a leaderboard ranks."""
+        """Return the entry as a leaderboard ranks it."""
         said, code = self.published, self.record.code_identity
         probed = "" if said.probe is None else said.probe.result
         seeds = {

@@ -327,7 +327,7 @@ class PPO:
         return masks.behind(own, infos) if isinstance(self.policy, Choices) else own
 
     def _nothing(self, network: nn.Module, lanes: int) -> Tensor:
-        """Return what a network remembers where episodes begin (S, lanes, M)."""
+        """Return a network's memory at the begin of episodes, zeros (S, lanes, M)."""
         return torch.zeros((self.S, lanes, remembers(network)), device=self.device)
 
     def start(self) -> None:

@@ -125,7 +125,7 @@ class PennyLaneBackend:
             )
         if self.diff_method == "parameter-shift":
             return torch.stack([self._shifted(angles[:, s], None) for s in range(S)])
-        step = self._seeds_per_pass(S, B, angles.requires_grad)
+        step = self._seeds_per_pass(B, angles.requires_grad)
         if step >= S:
             return self._pass(angles)
         passes = []
@@ -183,7 +183,7 @@ class PennyLaneBackend:
         """Return how many lanes one execution without gradients takes, so that its states fit in memory."""
         return max(1, MEMORY // (4 * 16 * (1 << self.circuit.qubits)))
 
-    def _seeds_per_pass(self, S: int, B: int, differentiated: bool) -> int:
+    def _seeds_per_pass(self, B: int, differentiated: bool) -> int:
         """Return how many seeds one execution takes, so that its states fit in memory."""
         states = len(self.circuit) // 2 if differentiated and self.diff_method == "backprop" else 1
         return max(1, self.lanes_per_pass() // (max(1, states) * B))

@@ -28,7 +28,7 @@ class GymOptions:
     """Options of `gym`."""
 
     id: Annotated[
-        str, Field(description="what gymnasium.make takes: Acrobot-v1, or MODULE:ID of another package")
+        str, Field(description="id for gymnasium.make: Acrobot-v1, or MODULE:ID of another package")
     ] = "CartPole-v1"
     arguments: Annotated[
         dict[str, Any], Field(description="further arguments of gymnasium.make, { map_name = '8x8' }")
@@ -38,10 +38,10 @@ class GymOptions:
     ] = None
     normalization: Annotated[Kind, Field(description=KIND)] = "none"
     low: Annotated[
-        tuple[float, ...] | None, Field(description="what becomes -1 with bounds; absent: the box's own")
+        tuple[float, ...] | None, Field(description="values mapped to -1 by bounds; absent: the box's own")
     ] = None
     high: Annotated[
-        tuple[float, ...] | None, Field(description="what becomes 1 with bounds; absent: the box's own")
+        tuple[float, ...] | None, Field(description="values mapped to 1 by bounds; absent: the box's own")
     ] = None
     observe: Annotated[
         tuple[int, ...] | None,

@@ -115,14 +115,14 @@ class VQCOptions:
         Field(
             gt=0,
             allow_inf_nan=False,
-            description="factor on the learning rate of what is behind the circuit, for values far beyond -1..1",
+            description="factor on the layer behind the circuit's learning rate, for values far beyond -1..1",
         ),
         Since("0.2.0"),
     ] = 1.0
     readout: Annotated[
         Readout,
         Field(
-            description="what is measured: ansatz, as it says (mostly Z of each qubit); single, Z of each qubit; "
+            description="observables: ansatz, its own (mostly Z of each qubit); single, Z of each qubit; "
             "products of Z: pairs (Z0 Z1, Z2 Z3, ...), neighbors in a ring, all-pairs, or the product of all"
         ),
         Since("0.2.0"),
@@ -137,7 +137,7 @@ class VQCOptions:
     ] = False
     output_reuse: Annotated[
         int,
-        Field(ge=1, le=64, description="how many times the expectation values are given to what is behind"),
+        Field(ge=1, le=64, description="copies of the expectation values for the layer behind the circuit"),
         Since("0.2.0"),
     ] = 1
     output_scale: Annotated[
@@ -536,11 +536,11 @@ def population(modules: Sequence[VQC | mlp.MLP], options: VQCOptions) -> VQCPopu
 def memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
     """Return the bytes of circuit states in memory; 0 if unknown."""
     if options.backend == "native":
-        return _native_memory(options, agents, batch, copies)
-    return _pennylane_memory(options, agents, batch, copies) if options.backend == "pennylane" else 0
+        return _native_memory(options, agents, batch)
+    return _pennylane_memory(options, agents, batch) if options.backend == "pennylane" else 0
 
 
-def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
+def _native_memory(options: VQCOptions, agents: int, batch: int) -> int:
     """Return the bytes of 2^n complex amplitudes, 8 each (16 in float64), of every sample, if they stay in memory.
 
     Three of the simulator's working states, of 128 bytes per amplitude, come on top.
@@ -550,7 +550,7 @@ def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) ->
     return 3 * 128 * amplitudes + (kept if kept <= NATIVE_STATES else 0)
 
 
-def _pennylane_memory(options: Any, agents: int, batch: int, copies: int) -> int:
+def _pennylane_memory(options: Any, agents: int, batch: int) -> int:
     """Return the bytes of the states behind every gate, 64 layers n 2^n per sample, where PennyLane backpropagates."""
     backprop = options.diff_method in ("auto", "backprop") and options.shots is None
     if not (backprop and options.device == "default.qubit"):

@@ -22,7 +22,7 @@ def scalars(record: Mapping[str, Any]) -> dict[str, float]:
 
 
 def settings(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a run was trained with, as a flat mapping: `task`, `seed`, ..., `algorithm.gamma`, `model.width`."""
+    """Return the settings of a run as a flat mapping: `task`, `seed`, ..., `algorithm.gamma`, `model.width`."""
     names = ("task", "task_hash", "entry", "label", "algorithm", "model", "family", "seed")
     found = {name: run[name] for name in names}
     for part in ("algorithm", "model"):
@@ -31,7 +31,7 @@ def settings(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def title(run: Mapping[str, Any]) -> str:
-    """Return what a run is called in a list of runs."""
+    """Return a run's name in a list of runs."""
     return f"{run['label']} seed {run['seed']}"
 
 

@@ -149,7 +149,7 @@ def _ansatz(
 
 
 def _code_of_plugin(kind: type[specs.Spec], name: str) -> dict[str, Any]:
-    """Return what a registered thing adds to the identity of an entry: its files or `numerics`.
+    """Return a registered thing's part of an entry's identity: its files or `numerics`.
 
     Raises
     ------

@@ -249,8 +249,8 @@ def run_study(
     -------
     StudyRun, or StudyOutcome of a study with looks
         With `pictures`, each with a matplotlib `figure`; an `overview` of the entries; and `as_dict()`. With looks:
-        `pairs`, each with its `verdict`, `difference` (mean time below threshold of the second over that of the first,
-        minus 1), `interval`, `p` and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
+        `pairs`, each with its `verdict`, `difference` (the second's mean time below threshold over the first's, minus
+        1), `interval`, `p` and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
 
     Raises
     ------
@@ -417,7 +417,7 @@ def find_work(
     where: Where,
     runs: str | PathLike[str],
 ) -> StudyWork:
-    """Find the missing seeds of a study, or of `all` registered studies; the arguments are those of `run_study`.
+    """Find the missing seeds of a study, or of `all` registered studies; arguments as for `run_study`.
 
     Raises
     ------

@@ -53,8 +53,8 @@ def table(
 
         Of entries: `preset`, `tuned`, `seeds`, `epochs`, `steps` (environment steps of each seed), `parameters`
         (trained numbers of an agent), `parameters_quantum`, `parameters_fixed`; means over seeds:
-        `steps_below_threshold` (environment steps, mean over the task's thresholds), `steps_lost` (those of them after
-        a threshold was first reached), `final_score` (of the last tenth of the epochs) and `area` (of all epochs), in
+        `steps_below_threshold` (environment steps, mean over the task's thresholds), `steps_lost` (their part after a
+        threshold was first reached), `final_score` (of the last tenth of the epochs) and `area` (of all epochs), in
         the unit of the task's scores; sums over seeds: `core_hours`, `executions` (of circuits).
 
         Of seeds: `seed`, `epochs`, `finished`, `diverged` (the first epoch after which numbers of its agent were not

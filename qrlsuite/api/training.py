@@ -329,8 +329,8 @@ def evaluate(
     entries:
         One or several entries of one task, each by name, label, the beginning of one of them, or folder.
     task:
-        The task that is played, by name or file: its own entries are meant, and those named `TASK/ENTRY`, or by their
-        folder, play it too, where observations and actions are the same. None plays the entries' own.
+        The task to play, by name or file. Names mean its own entries; entries of other tasks, named `TASK/ENTRY` or by
+        their folder, play it too if observations and actions are the same. None plays the entries' own task.
     best:
         How many agents of each entry.
     episodes:

@@ -158,5 +158,5 @@ class CircuitLayer(nn.Module):
         return [int(torch.randint(2**63 - 1, ()))]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy is made of: it prepares a backend of its own when it is first called."""
+        """Return the state for a copy, which prepares its own backend at its first call."""
         return {**self.__dict__, "_backend": None}

@@ -53,7 +53,7 @@ TasksOption = Annotated[
     list[str] | None,
     typer.Option(
         "--task",
-        help="Only this task. Repeat it to compare the entries that were trained on all of these tasks, by means.",
+        help="Only this task. Repeat it to compare entries that were trained on all these tasks, by means.",
         autocompletion=names_of("tasks"),
     ),
 ]
@@ -75,7 +75,7 @@ HorizonOption = Annotated[
         "--horizon",
         metavar="STEPS",
         min=1,
-        help="Cut all entries to their first STEPS environment steps; leave out those that are shorter.",
+        help="Cut all entries to their first STEPS environment steps; leave out shorter entries.",
     ),
 ]
 RunsOption = Annotated[
@@ -86,7 +86,7 @@ RuleOption = Annotated[
     typer.Option(
         "--rule",
         metavar="NAME",
-        help="What counts as significant: qrlsuite list rules; default: the task's, else intervals.",
+        help="Rule of significance: qrlsuite list rules; default: the task's, else intervals.",
     ),
 ]
 AlphaOption = Annotated[

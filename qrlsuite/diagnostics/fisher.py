@@ -1,13 +1,13 @@
 """The Fisher information of a policy or of values, directions without effect, and the effective dimension.
 
 With J (O, P) the derivatives of a network's O outputs by its P parameters at a state, and A (O, O) the Fisher
-information of what the outputs stand for, the Fisher information of the parameters is
+information of the distribution that the outputs parametrize, the Fisher information of the parameters is
 
     F = mean over states of J^T A J.
 
 For a softmax policy A = diag(p) - p p^T, so that F is the mean over states, and over actions as the policy draws them,
 of the outer product of the score, the gradient of log pi(a|s). For a normal policy A has the inverse variances on its
-diagonal. For Q-values, and expectation values of a circuit, A is the identity: F = J^T J, that of Gaussians of unit
+diagonal. For Q-values, and expectation values of a circuit, A is the identity: F = J^T J, as for Gaussians of unit
 variance around them.
 
 Directions in which F is 0 change nothing at any state, to first order: *gauge directions*.

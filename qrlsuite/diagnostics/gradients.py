@@ -2,7 +2,7 @@
 
 The variance of one derivative of an expectation value over random parameters, after McClean et al. 2018
 (arXiv:1803.11173): where it falls exponentially with the number of qubits, training is on a *barren plateau*. It
-depends on the readout, local or global, and on how the number of layers grows with that of the qubits.
+depends on the readout, local or global, and on how the number of layers grows with the number of qubits.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def expressibility(found: Array, qubits: int, bins: int = BINS) -> float:
     """Return the divergence of fidelities of random pairs of states from Haar's, in natural units.
 
     The fidelity of two states drawn by Haar's measure in d = 2^n dimensions has the density (d - 1) (1 - F)^(d - 2).
-    Fidelities are counted in bins of equal width, and the Kullback-Leibler divergence is that of the counts. It is 0
+    Fidelities are counted in bins of equal width, and the Kullback-Leibler divergence of the counts is taken. It is 0
     for Haar's states and (d - 1) log(bins) for one that never changes: the smaller, the more expressive. N pairs make
     it too large by about (occupied bins - 1) / (2 N).
 

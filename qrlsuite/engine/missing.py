@@ -211,7 +211,7 @@ def check_memory(work: Missing, where: Where) -> None:
 
 
 def summarize(work: Missing) -> dict[str, Any]:
-    """Return what a (partly) finished training amounts to by now, as plain values."""
+    """Return a summary of a (partly) finished training as plain values."""
     store, epochs = work.store, work.epochs
     runs = [run for seed in work.seeds if len((run := store.seed(seed).read()).scores) >= epochs]
     complete = [run.curve[:epochs] for run in runs]
@@ -256,6 +256,6 @@ def _newest_probe(work: Missing) -> str | None:
 
 
 def _warnings(store: EntryStore, group: SeedGroup) -> list[str]:
-    """Return what a group's worker left for the user to know."""
+    """Return the warnings of a group's worker."""
     left = ProgressFile(store, group.id).read().get("warnings")
     return [str(message) for message in left] if isinstance(left, list) else []

@@ -54,7 +54,7 @@ class Shown:
 
 
 def _parts(shown: Any, console: Console) -> Iterator[Any]:
-    """Return what a result shows, in order: tables, texts, and sheets, which write themselves as HTML."""
+    """Return the parts of a result, in order: tables, texts, and sheets, which write themselves as HTML."""
     if hasattr(shown, "__rich__"):
         yield from _parts(shown.__rich__(), console)
     elif isinstance(shown, str | Text | Table) or hasattr(shown, "html"):

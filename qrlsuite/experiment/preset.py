@@ -50,7 +50,7 @@ class TuningRecord(options.Table):
     runs: Annotated[int | None, Field(ge=1, description="of all trials together, a seed each")] = None
     budget: Annotated[
         str | None,
-        Field(max_length=200, description="what the search was allowed; equal for models tuned together"),
+        Field(max_length=200, description="budget of the search; equal for models tuned together"),
     ] = None
     rungs: Annotated[
         tuple[tuple[int, int], ...] | None,
@@ -59,12 +59,12 @@ class TuningRecord(options.Table):
     regret: RegretRecord | None = None
     epochs: Annotated[int | None, Field(ge=1, description="of every trial")] = None
     steps: Annotated[int | None, Field(ge=0, description="environment steps of all trials together")] = None
-    space: Annotated[dict[str, Any] | None, Field(description="what every option was chosen from")] = None
+    space: Annotated[dict[str, Any] | None, Field(description="values or range of every option")] = None
     versions: dict[str, str] = {}
     core_hours: Annotated[
         float | None, Field(ge=0, description="measured; differs from machine to machine")
     ] = None
-    note: Annotated[str | None, Field(max_length=1000, description="what the other fields cannot say")] = None
+    note: Annotated[str | None, Field(max_length=1000, description="facts beside the other fields")] = None
     on_protocol_seeds: Annotated[
         bool,
         Field(description="chosen on seeds that entries are judged by; always so where `seeds` has some"),

@@ -85,7 +85,7 @@ class ScoreSection(options.Table):
         Field(
             pattern=specs.WHOLE_NAME,
             max_length=64,
-            description="what of the environment's info['metrics'] is ranked in place of a score, on thresholds",
+            description="metric in the environment's info['metrics'] to rank in place of a score, on thresholds",
         ),
     ] = None
     goal: Annotated[
@@ -164,7 +164,7 @@ class RankingSection(options.Table):
     ] = None
     costs: Annotated[
         list[Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64)]],
-        Field(description="what of info['metrics'] boards show beside the score, less is better: violations"),
+        Field(description="metrics in info['metrics'] to show beside the score, less is better: violations"),
     ] = []
     policies: Annotated[
         dict[

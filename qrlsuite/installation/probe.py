@@ -37,7 +37,7 @@ def main(modules: list[str]) -> None:
 
 
 def gpu() -> str:
-    """Return what torch was built for, and the GPUs that it sees."""
+    """Return torch's build and its GPUs."""
     import torch
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0

@@ -212,7 +212,7 @@ def _templates() -> jinja2.Environment:
 
 
 def _ranking(kind: Kind, scores: tuple[float, float] | None) -> dict[str, object]:
-    """Return what a task's template says of the range of scores and of the thresholds in it."""
+    """Return the range of scores and the thresholds for a task's template."""
     usual = _WORDS[kind].range
     if usual is None:
         if scores is not None:

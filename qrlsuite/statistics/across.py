@@ -1,6 +1,6 @@
 """Several tasks at once: entries by their mean time below threshold as a share of each task's horizon.
 
-One number per run and task, in [0, 1], less is better: `horizon_shares`. The aggregates are those of rliable
+One number per run and task, in [0, 1], less is better: `horizon_shares`. The aggregates are from rliable
 (Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice"): mean and
 interquartile mean with a stratified bootstrap (runs are redrawn within tasks), and the probability of improvement.
 Of one pair, `mean_ratio` averages the ratios of the mean times, so that no task counts for more because it is longer.

@@ -58,8 +58,8 @@ def bootstrap_interval(
     seed:
         The same seed gives the same interval, on every machine.
     n_runs:
-        Runs per resample; None means all N. With fewer than N the interval is that of an entry of `n_runs`
-        runs, for a comparison at equal numbers: it is centered on the median of its draws, and not widened
+        Runs per resample; None means all N. With fewer than N it is the interval of an entry of `n_runs` runs,
+        for a comparison at equal numbers: it is centered on the median of its draws, and not widened
         to the S_hat of all N runs, because S_hat at another number of runs is another quantity.
 
     Returns

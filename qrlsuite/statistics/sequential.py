@@ -367,7 +367,7 @@ class Decision:
 
 
 def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: Grid) -> Decision:
-    """Return what a design decides from the runs so far.
+    """Return a design's decision from the runs so far.
 
     Parameters
     ----------
@@ -396,7 +396,7 @@ def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: G
 
 
 def decide_times(design: SequentialDesign, times: Mapping[str, IntArray]) -> Decision:
-    """Return what a design decides from times below threshold, (N, E) for each entry: see `decide`."""
+    """Return a design's decision from times below threshold, (N, E) for each entry: see `decide`."""
     pairs = begin(design)
     for look, n_runs in enumerate(design.looks):
         wanted = wanted_at(pairs, n_runs)

@@ -208,7 +208,7 @@ class IntervalRule:
 
 
 def check_signs(signs: object, shape: tuple[int, ...], rule: SignificanceRule) -> IntArray:
-    """Return what a rule answered as integers, or raise OptionError if it is not -1, 0 or 1 in every cell."""
+    """Return a rule's answer as integers, or raise OptionError if it is not -1, 0 or 1 in every cell."""
     array = np.asarray(signs)
     if array.shape != shape or not np.isin(array, (-1, 0, 1)).all():
         raise OptionError(

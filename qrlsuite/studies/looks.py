@@ -550,7 +550,7 @@ def _content(file: StudyFile) -> dict[str, Any]:
 
 
 def _lines(design: SequentialDesign, decision: Decision) -> list[dict[str, Any]]:
-    """Return what each look found: for every pair that was open, its p and how it was closed."""
+    """Return the results of each look: for every open pair, its p and how it was closed."""
     lines = []
     for index, look in enumerate(design.looks):
         pairs = [

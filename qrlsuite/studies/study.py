@@ -171,8 +171,8 @@ class StudyFile(Table):
     name: Name
     summary: Annotated[str, Field(min_length=1)]
     source: Annotated[str, Field(description="where it was published: section, figure")] = ""
-    reports: Annotated[str, Field(description="what was reported there")] = ""
-    core_hours: Annotated[float | None, Field(ge=0, description="what it cost there, in core-hours")] = None
+    reports: Annotated[str, Field(description="the result reported there")] = ""
+    core_hours: Annotated[float | None, Field(ge=0, description="its cost there, in core-hours")] = None
     looks: LooksSection | None = None
     entries: list[EntriesSection] = []
     pictures: list[PictureSection] = []

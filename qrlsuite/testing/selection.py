@@ -23,7 +23,7 @@ class CheckTarget:
 
 
 def select(word: str) -> list[CheckTarget]:
-    """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, or a task's file.
+    """Return the targets of a word: `NAME`, `KIND:NAME`, a distribution, or a task's file.
 
     A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
     own; `distribution:NAME` says so where it is not.

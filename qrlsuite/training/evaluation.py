@@ -170,7 +170,7 @@ def require_fitting(trainer: Trainer, agent: Mapping[str, NDArray[Any]], path: P
 
 
 def _state(trainer: Trainer) -> dict[str, torch.Tensor]:
-    """Return what a trained agent is loaded into, seed-first by name."""
+    """Return the tensors that a trained agent is loaded into, seed-first by name."""
     state = dict(trainer.algorithm.policy_state())
     return state if trainer.statistics is None else {**state, **trainer.statistics.published()}
 

@@ -233,7 +233,7 @@ def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[A
 
 
 Part = tuple[Entry, store.EntryStore, Sequence[int]]
-"""An entry, its folder, and those of its seeds that a group trains."""
+"""An entry, its folder, and its seeds in a group."""
 
 
 def _required_code(entry: Entry, entry_store: store.EntryStore) -> CodeIdentity:

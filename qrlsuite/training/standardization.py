@@ -5,7 +5,7 @@ mean m and variance v of each observed value sees
 
     z = clip((x - m) / sqrt(v + 1e-8), -10, 10)
 
-in place of the observation x, in all of its networks. The constants are those of Stable-Baselines3's `VecNormalize`;
+in place of the observation x, in all of its networks. The constants are from Stable-Baselines3's `VecNormalize`;
 Gymnasium's `NormalizeObservation` does not clip.
 
 - *Whose.* Statistics belong to a seed. They are gathered from every observation that a step of its training

@@ -21,9 +21,9 @@ from qrlsuite.tuning.space import Dimension, Point, Space
 NAMES = {
     "bayesian": "settings that may be the best by a smooth surrogate, until the expected regret is small",
     "grid": "every combination",
-    "one-at-a-time": "each option through its values, the others as they are without tuning",
+    "one-at-a-time": "each option through its values, the others untuned",
     "random": "combinations drawn at random, none twice",
-    "tpe": "proposals of Optuna's tree-structured Parzen estimator, after what was seen",
+    "tpe": "proposals of Optuna's tree-structured Parzen estimator, after earlier trials",
 }
 
 REGRET = 0.05

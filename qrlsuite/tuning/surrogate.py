@@ -237,7 +237,7 @@ class Climb:
         return places, surrogate.draws(np.array([self._encode(place) for place in places]), generator)
 
     def _values(self, place: Floats) -> tuple[float, ...]:
-        """Return what a place shares with others that are trained with it."""
+        """Return the values that a place shares with others that are trained with it."""
         return tuple(np.round(place[self._shared], 9))
 
     def _others(

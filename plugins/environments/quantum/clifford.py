@@ -61,7 +61,7 @@ def gates(options: CliffordOptions) -> list[Gate]:
 
 
 def matrices(options: CliffordOptions) -> IntArray:
-    """Return what each gate does to a Pauli word: its symplectic matrix (gates, 2n, 2n), bits.
+    """Return each gate's action on Pauli words: its symplectic matrix (gates, 2n, 2n), bits.
 
     A word is a row of bits (x_1 .. x_n, z_1 .. z_n): X^x Z^z, without its sign. A gate maps the row v to v M, modulo 2.
     Aaronson and Gottesman, "Improved simulation of stabilizer circuits" (2004), give these rules.

@@ -30,9 +30,7 @@ class EpisodeOptions:
 
     policy: Annotated[
         Literal["best", "greedy"],
-        Field(
-            description="who plays: the best policy that is known, or the greedy one (of channel: in turn)"
-        ),
+        Field(description="policy that plays: the best known one, or the greedy one (of channel: in turn)"),
     ] = "best"
     seed: Annotated[int, Field(ge=0, description="the same seed draws the same episode")] = 0
 

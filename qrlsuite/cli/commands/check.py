@@ -24,7 +24,7 @@ def check(
         str | None,
         typer.Argument(
             metavar="NAME|KIND:NAME|DISTRIBUTION",
-            help="What is registered, a whole distribution, or a task's file.",
+            help="A registered name, a whole distribution, or a task's file.",
         ),
     ] = None,
     settings: Annotated[
@@ -42,7 +42,7 @@ def check(
     ] = None,
     deterministic: Annotated[
         bool,
-        typer.Option("--deterministic", help="The episodes of this environment are meant to be all alike."),
+        typer.Option("--deterministic", help="All episodes of this environment are meant to be equal."),
     ] = False,
     json_output: JsonOption = False,
 ) -> None:
@@ -134,7 +134,7 @@ def _show(
     total = sum(len(findings) for _, findings in results)
     if broken:
         console.print(
-            f"{broken} of {total} rules broken; some are tried only where those hold", style="bold red"
+            f"{broken} of {total} rules broken; some are tried only after these hold", style="bold red"
         )
     else:
         console.print(f"all {total} rules hold", style="bold green")

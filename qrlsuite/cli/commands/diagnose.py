@@ -48,7 +48,7 @@ def diagnose(
     episodes: Annotated[
         int, typer.Option("--episodes", min=1, max=1000, help="Episodes of each agent.")
     ] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of what is drawn, and of the episodes.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of draws and episodes.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Draw to a png, pdf or svg file.")
     ] = None,

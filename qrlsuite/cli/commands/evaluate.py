@@ -30,7 +30,7 @@ def evaluate(
         str | None,
         typer.Option(
             "--task",
-            help="The task that is played. Its own entries are meant; TASK/ENTRY and a folder name those of another.",
+            help="The task to play. Names mean its own entries; TASK/ENTRY or a folder names an entry of another task.",
             autocompletion=names_of("tasks"),
         ),
     ] = None,

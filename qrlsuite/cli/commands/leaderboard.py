@@ -73,14 +73,14 @@ def leaderboard(
         typer.Option(
             "--by",
             metavar="|".join(AXES),
-            help="What entries are ranked by: environment steps, executions, shots or core-hours below threshold, the "
+            help="Axis of the ranking: environment steps, executions, shots or core-hours below threshold, the "
             "final score, the area under the learning curve, or a cost that the task's [ranking] names.",
             autocompletion=lambda: list(AXES),
         ),
     ] = "steps",
     explain: Annotated[
         bool,
-        typer.Option("--explain", help="Say what columns and marks mean, and how each pair was decided."),
+        typer.Option("--explain", help="Explain columns and marks, and how each pair was decided."),
     ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
@@ -103,7 +103,7 @@ def leaderboard(
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all; --entry then compares these alone. Entries whose record does not hold the cost, or not so
     that it can be compared, have no rank.
-    --by score ranks by the mean score of the last tenth of the epochs, and --by area by that of all epochs. Metrics of
+    --by score ranks by the mean score of the last tenth of the epochs, --by area by the mean of all epochs. Metrics of
     the environment that the task file names in [ranking] costs are columns; --by their names ranks by them, less first.
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published

@@ -35,10 +35,10 @@ def plugin(
         str | None,
         typer.Argument(
             metavar="[NAME]",
-            help="The package's name, also that of what it registers: acme-ring. Of a file: its own.",
+            help="Name of the package, and of the thing that it registers: acme-ring. With --from: the file's name.",
         ),
     ] = None,
-    kind: Annotated[Kind | None, typer.Option("--kind", help="What it adds.")] = None,
+    kind: Annotated[Kind | None, typer.Option("--kind", help="Kind of thing that it adds.")] = None,
     source: Annotated[
         Path | None,
         typer.Option("--from", metavar="PATH", help="Make the package of a plugin that lies there: ring.py."),
@@ -49,7 +49,7 @@ def plugin(
             "--range",
             metavar="RANDOM BEST",
             help="For a task: the score of random actions and the best known one, between which its thresholds are "
-            "spread. Numbers outside 0..1 are returns. Default: those of the template's environment.",
+            "spread. Numbers outside 0..1 are returns. Default: scores of the template's environment.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder to write it into.")] = Path(),

@@ -25,7 +25,7 @@ def play(
         str | None,
         typer.Option(
             "--task",
-            help="The task that is played. Its own entry is meant; TASK/ENTRY and a folder name one of another.",
+            help="The task to play. A name means its own entry; TASK/ENTRY or a folder names an entry of another task.",
             autocompletion=names_of("tasks"),
         ),
     ] = None,

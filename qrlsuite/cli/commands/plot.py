@@ -34,7 +34,7 @@ class PlotCommand(TyperCommand):
 
 
 def plot(
-    kind: Annotated[str, typer.Argument(help="What to draw; the kinds are listed below.")],
+    kind: Annotated[str, typer.Argument(help="Kind of picture; the kinds are listed below.")],
     settings: Annotated[
         list[str] | None,
         typer.Argument(

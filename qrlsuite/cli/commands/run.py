@@ -86,7 +86,7 @@ def run(
         typer.Option(
             "--from",
             metavar="ENTRY",
-            help="Begin with the trained agents of this entry, seed k with that of seed k; [TASK/]ENTRY, or a folder.",
+            help="Begin with the trained agents of this entry, seed k with seed k's agent; [TASK/]ENTRY, or a folder.",
             autocompletion=entries_here,
         ),
     ] = None,

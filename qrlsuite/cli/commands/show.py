@@ -42,9 +42,7 @@ def show(
     ] = None,
     code: Annotated[
         bool,
-        typer.Option(
-            "--identity", help="Show the code identity, and what it is taken of: of an entry or a plugin."
-        ),
+        typer.Option("--identity", help="Show the code identity of an entry or a plugin, and its parts."),
     ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),

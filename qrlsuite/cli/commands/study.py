@@ -87,7 +87,7 @@ def new(
         typer.Option(
             "--looks",
             metavar="N,M,...",
-            help="Seeds of each entry at each look, and what else the file's table [looks] has: '20,40 alpha=.01' "
+            help="Seeds of each entry at each look, and further keys of the file's table [looks]: '20,40 alpha=.01' "
             "(probability of any false difference), margin=.1 (entries that differ by less count as equal), spending, "
             "first_seed, and the reason for a first look before 20 seeds.",
         ),
@@ -131,7 +131,7 @@ def run(
     epochs: EpochsOption = None,
     budget: BudgetOption = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what would be trained, and train nothing.")
+        bool, typer.Option("--dry-run", help="Print the planned training, and train nothing.")
     ] = False,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
@@ -194,7 +194,7 @@ def draw(
 ) -> None:
     """Draw a study's pictures from finished seeds; trains nothing.
 
-    The sample complexity of few seeds is another quantity than that of many: --seeds 20 draws equal numbers. Of a study
+    Sample complexities of few and of many seeds are different quantities: --seeds 20 draws equal numbers. Of a study
     with looks, every pair is drawn below its question, and every entry by its steps below threshold; of several, each
     of another task, the pairs that all of them compare, task by task.
 

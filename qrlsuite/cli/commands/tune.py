@@ -108,7 +108,7 @@ def tune(
         typer.Option("--out", metavar="FILE.toml", help="The preset file; default: below --runs."),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help=f"Start a search of more than {LARGE} trials.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what it would be, and stop.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and stop.")] = False,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     device: DeviceOption = "cpu",

@@ -21,9 +21,7 @@ from qrlsuite.results.progress import Progress as RunProgress
 def verify(
     paths: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="[PATH]...", help="Entries, or folders of entries; default: those of the suite."
-        ),
+        typer.Argument(metavar="[PATH]...", help="Entries, or folders of entries; default: the suite's."),
     ] = None,
     rerun: Annotated[
         str,
@@ -39,7 +37,7 @@ def verify(
         typer.Option(
             "--base",
             metavar="REV",
-            help="Check what of leaderboard/ differs from this git commit, entries and studies, in place of PATH.",
+            help="In place of PATH: entries and studies in leaderboard/ that differ from this git commit.",
         ),
     ] = None,
     json_output: JsonOption = False,
