@@ -406,11 +406,12 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
 
 
 def _of_run(store: EntryStore, run: SeedRun) -> SeedResult:
-    probe = probes.of_record(run.record) or {"result": ""}
-    if probe["result"] == probes.DIFFERS:
+    assert run.record is not None
+    probe = run.record.probe
+    if probe is not None and probe.result == probes.DIFFERS:
         raise StoreError(
-            f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.get('seed')} "
-            f"differs in {probe.get('difference')}; `qrlsuite check` looks for the cause"
+            f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.seed} "
+            f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
         )
     return SeedResult(
         store.path,
@@ -422,10 +423,10 @@ def _of_run(store: EntryStore, run: SeedRun) -> SeedResult:
         run.clocked,
         run.diverged,
         run.measured,
-        run.record.get("parameters", {}),
-        run.record.get("provenance", []),
-        codes.read(run.record, store.seed(run.seed).path),
-        probe["result"],
+        run.record.parameters,
+        run.record.provenance,
+        run.record.code_identity,
+        "" if probe is None else probe.result,
     )
 
 

@@ -23,9 +23,8 @@ from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance
-from qrlsuite.results.records import EntryRecord
+from qrlsuite.results.records import MEASURED, EntryRecord, Provenance
 from qrlsuite.results.seeds import parse_seeds, read_seeds
-from qrlsuite.results.store import MEASURED
 from qrlsuite.results.text import counted
 
 BESIDE = "-published"
@@ -58,7 +57,7 @@ class SeedResult:
     parameters:
         Numbers of its agent: `classical` and `quantum` ones that are trained, summed over `networks`; `fixed` ones.
     made_with:
-        What made it, see `qrlsuite.results.provenance.collect`.
+        What made it.
     code:
         The identity of the code that began it; None where that was not recorded.
     probed:
@@ -79,7 +78,7 @@ class SeedResult:
     diverged: int | None = None
     measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     parameters: Mapping[str, int] = field(default_factory=dict)
-    made_with: Sequence[Mapping[str, Any]] = ()
+    made_with: Sequence[Provenance] = ()
     code: CodeIdentity | None = None
     probed: str = ""
     published: bool = False
@@ -321,7 +320,7 @@ class EntryResults(Shown):
         return None if None in clocked else True in clocked
 
     @cached_property
-    def _made_with(self) -> list[Mapping[str, Any]]:
+    def _made_with(self) -> list[Provenance]:
         """What made the seeds, each once."""
         made = (made for result in self.records.values() for made in result.made_with)
         return list({id(each): each for each in made}.values())
@@ -334,17 +333,17 @@ class EntryResults(Shown):
     @property
     def commits(self) -> tuple[str, ...]:
         """Every code revision that occurs among the seeds."""
-        return provenance.texts(self._made_with, "commit")
+        return provenance.distinct(origin.commit for origin in self._made_with)
 
     @property
     def processors(self) -> tuple[str, ...]:
         """Every processor that occurs among the seeds."""
-        return provenance.texts(self._made_with, "processor")
+        return provenance.distinct(origin.processor for origin in self._made_with)
 
     @property
     def devices(self) -> tuple[str, ...]:
         """Every kind of device that occurs among the seeds."""
-        return provenance.devices(self._made_with)
+        return provenance.distinct(origin.device.kind for origin in self._made_with)
 
     @property
     def unprobed(self) -> bool:

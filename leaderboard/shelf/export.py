@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
 from qrlsuite.results import codes, probes
+from qrlsuite.results.records import Provenance
 from qrlsuite.results.store import Arrays, EntryStore, SeedRun, parameters_of
 
 
@@ -61,20 +62,22 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
             f"'{entry.label}' is not complete: {len(unfinished)} of {len(runs)} seeds are still training; "
             "repeat the `qrlsuite run` that made it"
         )
+    records = [run.record for run in runs if run.record is not None]
+    code = records[0].code
     content = published.files(
         {
             "preset": None,
             "tuning": None,
             **run,
             **({} if record.tuned is None else {"tuning": record.tuned}),
-            **({"code": runs[0].record["code"]} if entry.codes else {}),
+            **({"code": code.content} if entry.codes and code is not None else {}),
         },
         entry.seeds,
         entry.curves,
         [run.seconds / 3600 for run in runs],
         [run.executions for run in runs],
-        [_made_with(run.record.get("provenance") or [{}]) for run in runs],
-        {"classical": 0, "quantum": 0, **parameters_of(run.record for run in runs)},
+        [_made_with(record.provenance) for record in records],
+        {"classical": 0, "quantum": 0, **parameters_of(records)},
         fingerprint(built, entry.seeds),
         _found(runs),
         kept,
@@ -90,7 +93,7 @@ def _agents(store: EntryStore, entry: EntryResults) -> dict[int, Arrays]:
     ended = store.finished(entry.seeds, entry.curves.shape[1])
     held: dict[int, Arrays] = {}
     for seed in (store.seed(seed) for seed in entry.seeds if seed in ended):
-        longer = int((seed.record() or {})["epochs"]) > entry.curves.shape[1]
+        longer = seed.trained_epochs() > entry.curves.shape[1]
         agent = seed.parameters() if seed.agent.exists() and not longer else {}
         if agent and all(np.isfinite(values).all() for values in agent.values()):
             held[seed.seed] = agent
@@ -106,39 +109,43 @@ def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Ma
     if there.agents or len(rows) < len(entry.seeds) or not np.array_equal(there.curves[rows], entry.curves):
         return False
     stated, files = published.encode_agents(agents)
-    origins = [_made_with((store.seed(seed).record() or {}).get("provenance") or [{}]) for seed in agents]
-    stated["agents"]["provenance"] = [json.loads(origin) for origin in dict.fromkeys(map(_frozen, origins))]
-    record = there.record.changed(published={**there.published.content, **stated})
+    records = [record for seed in agents if (record := store.seed(seed).record()) is not None]
+    origins = _distinct(_made_with(record.provenance) for record in records)
+    stated["agents"]["provenance"] = [origin.content for origin in origins]
+    extended = there.record.changed(published={**there.published.content, **stated})
     kept = {name: (folder / name).read_bytes() for name in (published.CURVES, published.SEEDS)}
-    _replace(folder, {"entry.json": published.encode_record(record.content), **kept, **files})
+    _replace(folder, {"entry.json": published.encode_record(extended.content), **kept, **files})
     published.read(folder).parameters()
     return True
 
 
-_OF_PROBE = ("result", "seed", "epochs", "reason", "seconds", "cpu")
+_OF_PROBE = {"result", "seed", "epochs", "reason", "seconds", "cpu"}
 
 
 def _found(runs: Sequence[SeedRun]) -> dict[str, Any]:
     """Return which seeds diverged, and the probe of independent seeds; of either nothing, where there is none."""
     diverged = {str(run.seed): run.diverged for run in runs if run.diverged is not None}
-    made = [probe for run in runs if (probe := probes.of_record(run.record)) is not None]
-    made.sort(key=lambda probe: probe["result"] != probes.EQUAL)
-    kept = {name: made[0][name] for name in _OF_PROBE if name in made[0]} if made else {}
+    made = sorted(
+        probes.of_records(run.record for run in runs), key=lambda probe: probe.result != probes.EQUAL
+    )
+    kept = made[0].model_dump(include=_OF_PROBE, exclude_unset=True) if made else {}
     return {name: value for name, value in (("diverged", diverged), ("probe", kept)) if value}
 
 
-def _made_with(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _made_with(origins: Sequence[Provenance]) -> Provenance:
     """Return the provenance of a seed's last epochs; under `before`, different provenances of earlier epochs.
 
     The `host` in a remote worker's record is private.
     """
-    *earlier, last = [{name: part for name, part in record.items() if name != "host"} for record in records]
-    before = [record for record in dict.fromkeys(map(_frozen, earlier)) if record != _frozen(last)]
-    return {**last, **({"before": [json.loads(record) for record in before]} if before else {})}
+    *earlier, last = [origin.without_host for origin in origins] or [Provenance()]
+    before = [origin for origin in _distinct(earlier) if origin != last]
+    return last.changed(before=before) if before else last
 
 
-def _frozen(record: Mapping[str, Any]) -> str:
-    return json.dumps(record, sort_keys=True)
+def _distinct(origins: Iterable[Provenance]) -> list[Provenance]:
+    """Return records, each once, with their keys in the alphabet's order."""
+    texts = dict.fromkeys(json.dumps(origin.content, sort_keys=True) for origin in origins)
+    return [Provenance.model_validate(json.loads(text)) for text in texts]
 
 
 def _refuse_smaller(folder: Path, entry: EntryResults, force: bool) -> None:

@@ -20,7 +20,7 @@ from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, UnknownNameError, listed, nearest
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.store import MEASURED
+from qrlsuite.results.records import MEASURED
 from qrlsuite.statistics import areas, final_scores, last_epochs
 from qrlsuite.statistics.times import times_below, times_lost
 

@@ -35,7 +35,7 @@ from qrlsuite.results import provenance
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.genuine import require_no_link
 from qrlsuite.results.points import Points, Run
-from qrlsuite.results.records import EntryRecord
+from qrlsuite.results.records import EntryRecord, RunRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import (
     EntryStore,
@@ -447,26 +447,28 @@ def _write_seed(
     rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(curve, start=1)]
     write_atomically(made.table, table_bytes(rows))
     made.write_record(
-        {
-            "task": record.task_name,
-            "task_hash": record.task_hash,
-            "entry": record.name,
-            "label": record.label,
-            "algorithm": EXTERNAL,
-            "model": record.identity.model,
-            "parameters": {},
-            "seed": seed,
-            "interactions_per_epoch": record.task_file.protocol.interactions,
-            "status": "finished",
-            "epochs": len(rows),
-            "imported": {
-                "file": printable(own.source),
-                "points": len(own.steps),
-                "first_step": int(own.steps[0]),
-                "last_step": int(own.steps[-1]),
-            },
-            "provenance": [{"imported_with": provenance.collect([])["versions"]}],
-        }
+        RunRecord.model_validate(
+            {
+                "task": record.task_name,
+                "task_hash": record.task_hash,
+                "entry": record.name,
+                "label": record.label,
+                "algorithm": EXTERNAL,
+                "model": record.identity.model,
+                "parameters": {},
+                "seed": seed,
+                "interactions_per_epoch": record.task_file.protocol.interactions,
+                "status": "finished",
+                "epochs": len(rows),
+                "imported": {
+                    "file": printable(own.source),
+                    "points": len(own.steps),
+                    "first_step": int(own.steps[0]),
+                    "last_step": int(own.steps[-1]),
+                },
+                "provenance": [{"imported_with": provenance.collect([]).versions}],
+            }
+        )
     )
     made.path.rename(store.seed(seed).path)
 

@@ -30,9 +30,9 @@ from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results import checkpoint, codes, provenance, run_files
 from qrlsuite.results.claims import acquire, living
+from qrlsuite.results.records import MEASURED, Provenance, RunRecord
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
-    MEASURED,
     Arrays,
     EntryStore,
     SeedRun,
@@ -167,7 +167,8 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
     """Copy seeds with their agents and checkpoints."""
     training = {seed for claim in living(source) for seed in claim.seeds}
     newest, present = checkpoint.latest(source), set(store.seeds())
-    new, known, differing, waiting, versions = list[int](), list[int](), list[int](), list[int](), list[Any]()
+    new, known, differing, waiting = list[int](), list[int](), list[int](), list[int]()
+    origins: list[Provenance] = []
     for seed, run in runs.items():
         if seed in present:
             known.append(seed)
@@ -178,9 +179,9 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
         else:
             _place(store, seed, source.seed(seed).path)
             new.append(seed)
-            versions += run.record.get("provenance", [])
+            origins += [] if run.record is None else run.record.provenance
     _take_checkpoints(source, store, sorted({*new, *known} - {*differing}))
-    notes = differences(differing) + _other_versions(versions, entry)
+    notes = differences(differing) + _other_versions(origins, entry)
     if waiting:
         notes.append(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
@@ -232,26 +233,28 @@ def _from_export(
             made.timings, json_line({"epoch": len(rows), "cpu": 3600 * float(exported.hours[row])})
         )
         made.write_record(
-            {
-                **({} if entry.plan is None else {"plan": entry.plan}),
-                "task": entry.task.name,
-                "task_hash": entry.task.hash,
-                "entry": entry.name,
-                "label": entry.label,
-                "algorithm": entry.algorithm.name,
-                "model": entry.model.name,
-                "family": entry.model.family,
-                "parameters": exported.published.parameters,
-                "seed": seed,
-                "interactions_per_epoch": entry.task.file.protocol.interactions,
-                "status": "finished",
-                "epochs": len(rows),
-                **({} if (code := exported.record.code) is None else {"code": code.content}),
-                **({} if diverged is None else {"diverged": diverged}),
-                **({} if probe is None or probe.seed != seed else {"probe": probe.content}),
-                **({} if seed in agents else {"agent": False}),
-                "provenance": [dict(exported.provenance[row])],
-            }
+            RunRecord.model_validate(
+                {
+                    **({} if entry.plan is None else {"plan": entry.plan}),
+                    "task": entry.task.name,
+                    "task_hash": entry.task.hash,
+                    "entry": entry.name,
+                    "label": entry.label,
+                    "algorithm": entry.algorithm.name,
+                    "model": entry.model.name,
+                    "family": entry.model.family,
+                    "parameters": exported.published.parameters,
+                    "seed": seed,
+                    "interactions_per_epoch": entry.task.file.protocol.interactions,
+                    "status": "finished",
+                    "epochs": len(rows),
+                    **({} if exported.record.code is None else {"code": exported.record.code}),
+                    **({} if diverged is None else {"diverged": diverged}),
+                    **({} if probe is None or probe.seed != seed else {"probe": probe}),
+                    **({} if seed in agents else {"agent": False}),
+                    "provenance": [exported.provenance[row]],
+                }
+            )
         )
         if seed in agents:
             write_atomically(made.agent, encode(agents[seed]))
@@ -310,10 +313,10 @@ def differences(seeds: Sequence[int]) -> list[str]:
     ]
 
 
-def _other_versions(made_with: Sequence[Any], entry: Entry) -> list[str]:
+def _other_versions(origins: Sequence[Provenance], entry: Entry) -> list[str]:
     """Name the versions that made the seeds, if they differ from the installed ones."""
-    here = provenance.collect(entry.distributions())["versions"]
-    versions_there = provenance.versions(list(made_with))
+    here = provenance.collect(entry.distributions()).versions
+    versions_there = provenance.versions(origins)
     relevant = {"qrlsuite", "torch", "numpy", "numba", *entry.distributions()}
     other = [
         f"{name} {', '.join(known)} (here {here[name]})"

@@ -33,10 +33,16 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults, SeedResult, require_
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.notation import parse_entry
 from qrlsuite.registry import load as registered
-from qrlsuite.results import parquet, provenance
-from qrlsuite.results.records import AgentsRecord, EntryRecord, PublishedRecord
-from qrlsuite.results.store import (
+from qrlsuite.results import parquet
+from qrlsuite.results.records import (
     MEASURED,
+    AgentsRecord,
+    EntryRecord,
+    Provenance,
+    PublishedRecord,
+    RunRecord,
+)
+from qrlsuite.results.store import (
     Arrays,
     EntryStore,
     SeedRun,
@@ -104,7 +110,7 @@ class PublishedEntry:
         return self.record.published
 
     @property
-    def provenance(self) -> list[Mapping[str, Any]]:
+    def provenance(self) -> list[Provenance]:
         """The provenance of each seed, in the seeds' order."""
         return [self.published.provenance[index] for index in self.origins]
 
@@ -156,7 +162,7 @@ class PublishedEntry:
                 diverged=said.diverged.get(str(seed)),
                 measured=self.metrics(row),
                 parameters=said.parameters,
-                made_with=provenance.records(said.provenance[self.origins[row]]),
+                made_with=said.provenance[self.origins[row]].with_earlier,
                 code=code,
                 probed=probed,
                 published=True,
@@ -218,11 +224,18 @@ class _PublishedSeed(SeedStore):
         super().__init__(of.path, seed, of)
         self._published, self.agent = of, of.path / AGENTS
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> RunRecord:
         """Return the end and the code of a seed, as in `run.json`."""
         entry = self._published.published
-        code = {} if entry.record.code is None else {"code": entry.record.code.content}
-        return {**code, "status": "finished", "epochs": int(entry.curves.shape[1])}
+        return RunRecord(
+            task=entry.record.task_name,
+            task_hash=entry.record.task_hash,
+            entry=entry.record.name,
+            seed=self.seed,
+            code=entry.record.code,
+            status="finished",
+            epochs=entry.published.epochs,
+        )
 
     def read(self) -> SeedRun:
         """Return the seed's curve, hours and executions."""
@@ -501,7 +514,7 @@ def files(
     curves: NDArray[np.float64],
     hours: list[float],
     executions: list[int],
-    made_with: list[Mapping[str, Any]],
+    made_with: list[Provenance],
     parameters: Mapping[str, int],
     beginning: Fingerprint,
     found: Mapping[str, Any],
@@ -527,7 +540,7 @@ def files(
     measured:
         (N, T) by name, as `PublishedEntry` has them.
     """
-    distinct: list[Mapping[str, Any]] = []
+    distinct: list[Provenance] = []
     for made in made_with:
         if made not in distinct:
             distinct.append(made)
@@ -541,7 +554,7 @@ def files(
             "parameters": dict(parameters),
             "core_hours": round(math.fsum(hours), 6),
             "circuit_executions": sum(executions),
-            "provenance": distinct,
+            "provenance": [made.content for made in distinct],
             **found,
             **stated,
             **({"measured": sorted(measured)} if measured else {}),

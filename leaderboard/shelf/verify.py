@@ -27,6 +27,7 @@ from qrlsuite.leaderboard.shelf.fingerprint import CHUNK, fingerprint
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results import provenance, speed
 from qrlsuite.results.progress import Progress
+from qrlsuite.results.records import Provenance
 from qrlsuite.results.store import learning_curve
 from qrlsuite.results.text import hours_text
 
@@ -385,40 +386,38 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
     then not compared, and the device was the CPU.
     """
     here = provenance.of(made_by)
-    for record in (made for place in places for made in provenance.records(entry.provenance[place])):
-        if provenance.device_kind(record) != "cpu":
-            name = record["device"].get("name", "unknown")
-            return f"trained on the CPU here, on {provenance.device_kind(record)} ({name}) there"
-        versions = record.get("versions")
-        versions = versions if isinstance(versions, dict) else {}
-        for name, version in here["versions"].items():
-            compared = name != "qrlsuite" and (name in versions or name in provenance.PACKAGES)
-            if versions.get(name) != version and compared:
-                return f"{name} {version} here, {versions.get(name)} there"
-        numerics = record.get("numerics")
-        numerics = numerics if isinstance(numerics, dict) else {}
-        for role, number in here["numerics"].items():
-            if numerics.get(role, 1) != number:
-                return f"numerics {number} of the {role} here, {numerics.get(role, 1)} there"
-        for name in ("system", "python"):
-            if record.get(name) != here[name]:
-                return f"{name} {here[name]} here, {record.get(name)} there"
-        if differs := _other_instructions(here, record):
+    for there in (origin for place in places for origin in entry.provenance[place].with_earlier):
+        if there.device.kind != "cpu":
+            return f"trained on the CPU here, on {there.device.kind} ({there.device.name or 'unknown'}) there"
+        for name, version in here.versions.items():
+            compared = name != "qrlsuite" and (name in there.versions or name in provenance.PACKAGES)
+            if there.versions.get(name) != version and compared:
+                return f"{name} {version} here, {there.versions.get(name)} there"
+        for role, number in here.numerics.items():
+            if there.numerics.get(role, 1) != number:
+                return f"numerics {number} of the {role} here, {there.numerics.get(role, 1)} there"
+        if there.system != here.system:
+            return f"system {here.system} here, {there.system} there"
+        if there.python != here.python:
+            return f"python {here.python} here, {there.python} there"
+        if differs := _other_instructions(here, there):
             return differs
     return None
 
 
-def _other_instructions(here: Mapping[str, Any], record: Mapping[str, Any]) -> str | None:
-    """Name the difference between instruction sets of processors, unless both sides fixed them alike.
+def _other_instructions(here: Provenance, there: Provenance) -> str | None:
+    """Say in what the instruction sets differ: those of the processors, unless both sides fixed them alike.
 
     Older records have no `instructions`; nothing fixed them then.
     """
-    fixed, there = here["instructions"], record.get("instructions") or {}
-    if fixed != there:
-        return f"instruction sets fixed here by {fixed or 'nothing'}, there by {there or 'nothing'}"
-    if fixed.keys() == provenance.INSTRUCTIONS.keys() or record.get("processor") == here["processor"]:
+    fixed = here.instructions
+    if fixed != there.instructions:
+        return (
+            f"instruction sets fixed here by {fixed or 'nothing'}, there by {there.instructions or 'nothing'}"
+        )
+    if fixed.keys() == provenance.INSTRUCTIONS.keys() or there.processor == here.processor:
         return None
-    return f"processor {here['processor']} here, {record.get('processor')} there"
+    return f"processor {here.processor} here, {there.processor} there"
 
 
 def _differs(entry: PublishedEntry, place: int, again: NDArray[np.float64]) -> str:
@@ -454,8 +453,8 @@ def _plausible(entry: PublishedEntry, again: NDArray[np.float64], places: list[i
     """Return whether curves of another machine may belong to the entry, and the tests with their power."""
     count, first = len(entry.seeds), plausible.FIRST
     unlike = plausible.strangers(again, entry.curves, places)
-    made = (record for place in places for record in provenance.records(entry.provenance[place]))
-    if len(unlike) > plausible.tolerated(len(places), any(provenance.device_kind(m) != "cpu" for m in made)):
+    made = (origin for place in places for origin in entry.provenance[place].with_earlier)
+    if len(unlike) > plausible.tolerated(len(places), any(origin.device.kind != "cpu" for origin in made)):
         numbers = ", ".join(str(entry.seeds[places[row]]) for row in unlike)
         return (
             False,

@@ -193,7 +193,7 @@ def _outline(store: EntryStore) -> dict[str, Any]:
     made = published_entries.read(store.path)
     return content | {
         "seeds": len(made.seeds),
-        "provenance": made.published.provenance,
+        "provenance": [origin.content for origin in made.published.provenance],
         "parameters": made.published.parameters,
     }
 

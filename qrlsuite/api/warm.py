@@ -44,7 +44,7 @@ def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None 
     first = source.seed(agents[0])
     _require_fit(entry, agents[0], first.parameters(), first.agent)
     trained = evaluation.trained_entry(source)
-    epochs = int((first.record() or {})["epochs"])
+    epochs = first.trained_epochs()
     start = f"{trained.task.name}/{trained.name}{source.mark}:{epochs}"
     begun = replace(entry, start=start)
     store = EntryStore.find(runs, begun)

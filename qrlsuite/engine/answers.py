@@ -7,18 +7,20 @@ written can be read, ranked and continued like what was trained here.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import pydantic
 
+from qrlsuite import specs
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import TaskFile
+from qrlsuite.files import validation_lines
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.genuine import require_plain
+from qrlsuite.results.records import MEASURED, EpochLine, Provenance, TimingLine
 from qrlsuite.training.remote_task import POLICY
 
 if TYPE_CHECKING:
@@ -27,9 +29,7 @@ if TYPE_CHECKING:
 Layout = tuple[tuple[int, ...], str]
 """Shape of one seed's part of an array, and type."""
 
-MOST_SECONDS = 1e12
-_METRIC = re.compile(r"[A-Za-z_]\w{0,63}", re.ASCII)
-_TIMES = ("train", "validate", "cpu")
+_METRIC = re.compile(rf"[A-Za-z_]\w{{0,63}}|{MEASURED}\.{specs.NAME.pattern}", re.ASCII)
 _TOLERANCE = 1e-6
 
 
@@ -78,7 +78,10 @@ def require_fit(
     header: Mapping[str, Any], arrays: Arrays, asked: Asked, task: TaskFile, expected: Expected
 ) -> None:
     """Refuse an answer that is not one to the task that is waited for."""
-    problem = next(_problems(header, arrays, asked, task, expected), None)
+    try:
+        problem = next(_problems(header, arrays, asked, task, expected), None)
+    except pydantic.ValidationError as error:
+        problem = f"{error.title}: {validation_lines(error)[0]}"
     if problem is not None:
         raise StoreError(f"an answer does not fit its task: {problem}")
     require_plain("an answer", dict(header))
@@ -107,11 +110,13 @@ def _problems(
         yield "its warnings are no texts"
     for number, (of_seeds, timing) in enumerate(zip(lines, timings), start=asked.epoch + 1):
         yield from _line_problems(of_seeds, number, len(asked.seeds), task)
-        yield from _timing_problems(timing, number, len(asked.seeds))
+        times = TimingLine.model_validate(timing)
+        if (times.epoch, times.group) != (number, len(asked.seeds)):
+            yield f"the times of epoch {number} are not its own"
     if lines or error is None:
         if header.get("parameters") != expected.parameters:
             yield f"it counts other parameters than {json.dumps(expected.parameters)}"
-        yield from _origin_problems(header.get("provenance"))
+        Provenance.model_validate(header.get("provenance"))
     yield from _array_problems(arrays, asked, bool(lines), last == asked.epochs and error is None, expected)
 
 
@@ -120,74 +125,30 @@ def _line_problems(of_seeds: object, number: int, seeds: int, task: TaskFile) ->
     if not isinstance(of_seeds, list) or len(of_seeds) != seeds:
         yield f"the lines of epoch {number} are not one for each seed"
         return
-    for line in of_seeds:
-        if not isinstance(line, dict) or type(line.get("epoch")) is not int or line["epoch"] != number:
+    lines = [EpochLine.model_validate(line) for line in of_seeds]
+    for line in lines:
+        if line.epoch != number:
             yield f"the lines of epoch {number} are not one for each seed"
-            return
-        yield from _score_problems(line.get("scores"), number, task)
-        if line.keys() - _OPTIONAL != of_seeds[0].keys() - _OPTIONAL:
+        yield from _score_problems(line.scores or [], number, task)
+        if line.content.keys() - _OPTIONAL != lines[0].content.keys() - _OPTIONAL:
             yield f"the lines of epoch {number} hold different values"
-        for name, value in line.items():
-            if name in ("epoch", "scores"):
-                continue
-            if name == "diverged":
-                fits = value is True
-            elif name == "executions":
-                fits = isinstance(value, dict) and all(map(_is_executions, value.items()))
-            else:
-                fits = value is None or (type(value) is float and math.isfinite(value))
-            if not fits or not _METRIC.fullmatch(name):
-                yield f"a line of epoch {number} has {ascii(name)[:40]} = {ascii(value)[:40]}"
+        for name in line.model_extra or {}:
+            if not _METRIC.fullmatch(name):
+                yield f"a line of epoch {number} has {ascii(name)[:40]}"
 
 
 _OPTIONAL = {"diverged", "executions"}
 
 
-def _is_executions(item: tuple[str, object]) -> bool:
-    """Tell whether these are a number of circuit executions with its name; None counts nothing."""
-    name, count = item
-    return bool(_METRIC.fullmatch(name)) and (count is None or (type(count) is int and 0 <= count < 2**53))
-
-
-def _score_problems(scores: object, number: int, task: TaskFile) -> Iterator[str]:
+def _score_problems(scores: Sequence[float], number: int, task: TaskFile) -> Iterator[str]:
     """Check the scores of one validation."""
     episodes = task.protocol.validation_episodes
-    if not isinstance(scores, list) or len(scores) != episodes:
+    if len(scores) != episodes:
         yield f"epoch {number} has not {episodes} scores for each seed"
-    elif not all(type(score) is float and abs(score) <= np.finfo(np.float32).max for score in scores):
-        yield f"a score of epoch {number} is no finite number"
     elif task.ranking.thresholds is None and not (
         min(scores) >= -_TOLERANCE and max(scores) <= 1 + _TOLERANCE
     ):
         yield f"epoch {number} has scores from {min(scores):g} to {max(scores):g}, outside [0, 1]"
-
-
-def _timing_problems(timing: object, number: int, seeds: int) -> Iterator[str]:
-    """Check the line of times of one epoch."""
-    if not isinstance(timing, dict) or timing.get("epoch") != number or timing.get("group") != seeds:
-        yield f"the times of epoch {number} are not its own"
-        return
-    for name, value in timing.items():
-        if name in _TIMES:
-            fits = type(value) in (int, float) and 0 <= value < MOST_SECONDS
-        elif name in ("host", "time"):
-            fits = isinstance(value, str)
-        else:
-            fits = name in ("epoch", "group")
-        if not fits:
-            yield f"the times of epoch {number} have {ascii(name)[:40]} = {ascii(value)[:40]}"
-
-
-def _origin_problems(made: object) -> Iterator[str]:
-    """Check an answer's provenance: a table of texts, numbers, and tables of texts and numbers."""
-    if not isinstance(made, dict) or not isinstance(made.get("versions"), dict):
-        yield "it does not say where it was made"
-        return
-    values = [
-        value for each in made.values() for value in (each.values() if isinstance(each, dict) else [each])
-    ]
-    if not all(value is None or type(value) in (str, int, bool) for value in values):
-        yield "what it says about where it was made is no table of texts"
 
 
 def _array_problems(
@@ -221,14 +182,14 @@ def require_alike(
 
     On another kind of processor the last bits differ rightly: such answers say nothing about each other.
     """
-    made = [header.get("provenance") or {} for header in (first, second)]
-    if made[0].get("processor") != made[1].get("processor") or made[0].get("device") != made[1].get("device"):
+    made = [Provenance.model_validate(header.get("provenance") or {}) for header in (first, second)]
+    if made[0].processor != made[1].processor or made[0].device != made[1].device:
         return
     alike = first["lines"] == second["lines"] and all(
         name in others and array.tobytes() == others[name].tobytes() for name, array in arrays.items()
     )
     if not alike:
-        here, there = (ascii(origin.get("host"))[1:-1] for origin in made)
+        here, there = (ascii(origin.host)[1:-1] for origin in made)
         raise StoreError(
             f"two workers, on {here} and {there}, gave different answers to one task, and nothing of it was written: "
             "one of them computes wrongly; stop it, and repeat the command"

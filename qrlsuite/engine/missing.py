@@ -248,11 +248,8 @@ def _remove(folder: Path) -> None:
 
 def _newest_probe(work: Missing) -> str | None:
     """Describe the newest probe of these seeds, with its cost; None without one."""
-    for seed in work.todo:
-        probe = probes.of_record(work.store.seed(seed).record() or {})
-        if probe and probe["result"] != probes.DIFFERS:
-            return probes.sentence(probe)
-    return None
+    found = probes.of_records(work.store.seed(seed).record() for seed in work.todo)
+    return next((probes.sentence(probe) for probe in found if probe.result != probes.DIFFERS), None)
 
 
 def _warnings(store: EntryStore, group: SeedGroup) -> list[str]:

@@ -40,7 +40,7 @@ from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
-from qrlsuite.results.records import EntryRecord
+from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord
 from qrlsuite.results.store import EntryStore, read_arrays
 from qrlsuite.training.remote_task import pack, unpack
 
@@ -76,7 +76,7 @@ class Recorder:
         self._place = trainer.S // 2
         self._first = self._parameters(trainer)
 
-    def add(self, trainer: Trainer, lines: Sequence[Mapping[str, Any]], state: Arrays) -> bool:
+    def add(self, trainer: Trainer, lines: Sequence[EpochLine], state: Arrays) -> bool:
         """Add an epoch; returns whether the parameters have changed by now.
 
         Parameters
@@ -86,7 +86,7 @@ class Recorder:
         state:
             Result of `Trainer.capture` after it.
         """
-        self.side.lines.append(lines[self._place])
+        self.side.lines.append(lines[self._place].content)
         self.side.arrays = {name: array[self._place, None] for name, array in state.items()}
         self.side.changed = bool(_different(self._first, self._parameters(trainer)))
         return self.side.changed
@@ -217,33 +217,33 @@ class Probe:
             self._recorder, self._alone = Recorder(trainer), trainer.S == 1
         return self._recorder is None
 
-    def add(self, trainer: Trainer, lines: Sequence[Mapping[str, Any]], state: Arrays) -> bool:
+    def add(self, trainer: Trainer, lines: Sequence[EpochLine], state: Arrays) -> bool:
         """Add an epoch; returns whether `judge` can be called."""
         if self._made or self._recorder is None:
             return False
         changed = self._recorder.add(trainer, lines, state)
         return changed or len(self._recorder.side.lines) >= self.epochs
 
-    def judge(self) -> dict[str, Any]:
+    def judge(self) -> ProbeRecord:
         """Train the missing sides in fresh processes, and compare; return the value of `probe` in `run.json`."""
         self._made = True
-        began, seed = time.monotonic(), self.seed
-        found: dict[str, Any] = {
-            "seed": seed,
-            "device": self.device.partition(":")[0],
-            "code": code_of(self.entry),
-        }
+        began = time.monotonic()
+        facts = {"seed": self.seed, "device": self.device.partition(":")[0], "code": code_of(self.entry)}
+
+        def found(result: str, **more: Any) -> ProbeRecord:
+            return ProbeRecord.model_validate({**facts, "result": result, **more})
+
         try:
             epochs, changed, what, cpu = self._compare()
         except _ProbeFailed as error:
-            return {**found, "result": NOT_PROBED, "reason": str(error)}
+            return found(NOT_PROBED, reason=str(error))
         cost = {"seconds": round(time.monotonic() - began, 2), "cpu": round(cpu, 2)}
         if what:
-            return {**found, "result": DIFFERS, "epochs": epochs, "difference": what, **cost}
+            return found(DIFFERS, epochs=epochs, difference=what, **cost)
         if not changed:
             reason = f"no parameter has changed within {epochs} epochs"
-            return {**found, "result": NOT_PROBED, "reason": reason, **cost}
-        return {**found, "result": EQUAL, "epochs": epochs, **cost}
+            return found(NOT_PROBED, reason=reason, **cost)
+        return found(EQUAL, epochs=epochs, **cost)
 
     def _compare(self) -> tuple[int, bool, str, float]:
         """Return the compared epochs, whether parameters changed, the first difference, and the processor time."""
@@ -279,8 +279,8 @@ def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
     entry, store, seed = agents[len(agents) // 2]
     if not entry.third_party() or seed >= TUNING_SEEDS:
         return None
-    key = {"result": EQUAL, "device": device.partition(":")[0], "code": code_of(entry)}
-    if any({name: probe.get(name) for name in key} == key for probe in probes.of_entry(store)):
+    key = EQUAL, device.partition(":")[0], code_of(entry)
+    if any((probe.result, probe.device, probe.code) == key for probe in probes.of_entry(store)):
         return None
     try:
         claim = acquire(EntryStore(store.path / _FOLDER), [0])

@@ -41,7 +41,7 @@ from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire_each
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.provenance import PACKAGES
-from qrlsuite.results.records import EntryRecord
+from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord, Provenance, TimingLine
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, json_line
 from qrlsuite.training.remote_task import MOST_BYTES, POLICY, pack, too_large, unpack, versions
@@ -141,7 +141,7 @@ class _Run:
         self.versions = {name: version for name, version in found.items() if version is not None}
         self.seconds = checkpoint_seconds(TASK_SECONDS)
         self.expected = _expected(self.entry.hash, json_line(EntryRecord.of(self.entry).content))
-        self.found: dict[str, Any] | None = None
+        self.found: ProbeRecord | None = None
         """What a probe has found, see `qrlsuite.engine.probe`."""
         self.outcome = EngineOutcome()
         self.members = [_Member(work, group, works) for group in work.groups]
@@ -194,7 +194,7 @@ class _Run:
         finally:
             probe.claim.release()
             first.progress.phase = "waiting"
-        if self.found["result"] == probes.DIFFERS:
+        if self.found.result == probes.DIFFERS:
             raise probes.refusal(self.store, self.found)
 
     def _room(self) -> bool:
@@ -306,20 +306,26 @@ class _Run:
         self.claims.require_held(member.group.seeds)
         files, progress = self.files[member.group.id], member.progress
         if header["lines"] or header["error"] is None:
+            origin = Provenance.read(header["provenance"], "the worker's answer")
             if member.begun:
-                files.add_origin(header["provenance"])
+                files.add_origin(origin)
             else:
-                files.begin(member.epoch, header["parameters"], header["provenance"])
+                files.begin(member.epoch, header["parameters"], origin)
                 if self.found is not None:
                     files.add_probe(self.found)
                 member.begun = True
-        for lines, timing in zip(header["lines"], header["timings"]):
+        for epoch, (of_seeds, times) in enumerate(zip(header["lines"], header["timings"]), member.epoch + 1):
+            lines, timing = (
+                [EpochLine.model_validate(line) for line in of_seeds],
+                TimingLine.model_validate(times),
+            )
             files.record(lines, timing)
-            means = [sum(line["scores"]) / len(line["scores"]) for line in lines]
-            progress.finished_epoch(timing["epoch"], means, [line.get("diverged") is True for line in lines])
-            if timing["epoch"] == member.group.epoch + 1:
+            progress.finished_epoch(
+                epoch, [line.mean for line in lines], [bool(line.diverged) for line in lines]
+            )
+            if epoch == member.group.epoch + 1:
                 continue  # it holds what happens once
-            progress.epoch_seconds = len(lines) * sum(timing.get(name, 0.0) for name in ("train", "validate"))
+            progress.epoch_seconds = len(lines) * ((timing.train or 0.0) + (timing.validate_ or 0.0))
         policy = {name.removeprefix(POLICY): a for name, a in arrays.items() if name.startswith(POLICY)}
         state = {name: array for name, array in arrays.items() if not name.startswith(POLICY)}
         files.save(header["epoch"], state)

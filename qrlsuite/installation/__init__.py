@@ -83,7 +83,7 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda step: None) ->
 
 def _python(diagnosis: Diagnosis) -> None:
     cores, memory = usable_cores(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    commit = collect([])["commit"]
+    commit = collect([]).commit
     variables = [
         f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(VARIABLES)
     ]

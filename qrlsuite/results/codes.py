@@ -21,7 +21,7 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import genuine, survey
 from qrlsuite.results.claims import move_away
-from qrlsuite.results.records import PLUGINS, CodedRecord, EntryRecord
+from qrlsuite.results.records import PLUGINS, EntryRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, copies_of_plugins
 
@@ -52,11 +52,6 @@ class SameCode:
         return next(filter(None, self.codes), "0" * 8)[:8]
 
 
-def read(record: Mapping[str, Any], source: Path) -> CodeIdentity | None:
-    """Return the identity that a record has under `code`, None where it has none."""
-    return CodedRecord.read(record, source).code_identity
-
-
 def distinct(codes: Iterable[CodeIdentity | None]) -> tuple[str, ...]:
     """Return the digests of identities; none where one is unknown or of the suite's first bits: these are alike."""
     known = list(codes)
@@ -82,20 +77,16 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
     """
     seeds: dict[str, list[int]] = {}
     codes: dict[str, CodeIdentity | None] = {}
-    before: Mapping[str, Any] = {}
     for seed in store.seeds() if store.path.is_dir() else ():
         folder = store.seed(seed)
-        path = folder.path / "run.json"
         try:
             record = folder.record()
         except StoreError:  # is said where the seed is read
             continue
-        if record is None or not (record["epochs"] or folder.lines.exists() or folder.table.exists()):
+        if record is None or not (record.epochs or folder.lines.exists() or folder.table.exists()):
             continue
-        if not before or record.get("code") != before.get("code"):  # seeds mostly have the same
-            code, before = read(record, path), record
-            digest = UNKNOWN if code is None else code.digest
-        codes[digest] = code
+        digest = UNKNOWN if record.code is None else record.code.digest
+        codes[digest] = record.code_identity
         seeds.setdefault(digest, []).append(seed)
     return [
         SameCode(

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from qrlsuite.errors import StoreError
 
 if TYPE_CHECKING:
+    from qrlsuite.results.records import RunRecord
     from qrlsuite.results.store import EntryStore, SeedRun
 
 _CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff]")
@@ -47,7 +48,7 @@ def require_plain(path: Path | str, content: object) -> None:
             left += value
 
 
-def require_seed(folder: Path, seed: int, record: Mapping[str, Any], names: Mapping[str, Any]) -> None:
+def require_seed(folder: Path, seed: int, record: RunRecord, names: Mapping[str, str]) -> None:
     """Refuse a record of another seed, entry or task than the seed's folder is of.
 
     Parameters
@@ -56,11 +57,11 @@ def require_seed(folder: Path, seed: int, record: Mapping[str, Any], names: Mapp
         `entry`, `task` and `task_hash` of the entry that the folder lies in; empty where its own record is damaged.
     """
     for name, expected in {"seed": seed, **names}.items():
-        if record.get(name) != expected:
+        if (value := getattr(record, name)) != expected:
             of_entry = f" of {names['entry']} on task {names['task']}" if names else ""
             raise StoreError(
                 f"{folder}: its run.json does not say that it is seed {seed}{of_entry} ({name} is "
-                f"{record.get(name)!r} in it): delete the folder if it is a copy, or move it back where it belongs"
+                f"{value!r} in it): delete the folder if it is a copy, or move it back where it belongs"
             )
 
 

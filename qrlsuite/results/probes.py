@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable
 
 from qrlsuite import own, registry, specs
 from qrlsuite.errors import PluginError, StoreError
 from qrlsuite.results.provenance import PACKAGES
+from qrlsuite.results.records import ProbeRecord, Provenance, RunRecord
 from qrlsuite.results.store import EntryStore
 
 EQUAL, DIFFERS, NOT_PROBED = "equal", "differs", "not probed"
@@ -19,47 +19,45 @@ class DependentSeedsError(PluginError):
     """A seed gives another result in company than alone."""
 
 
-def of_record(record: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the probe in a `run.json`; None where it has none."""
-    probe = record.get("probe")
-    return probe if isinstance(probe, dict) and isinstance(probe.get("result"), str) else None
+def of_records(records: Iterable[RunRecord | None]) -> list[ProbeRecord]:
+    """Return the probes of runs that have one."""
+    return [record.probe for record in records if record is not None and record.probe is not None]
 
 
-def of_entry(store: EntryStore) -> list[dict[str, Any]]:
+def of_entry(store: EntryStore) -> list[ProbeRecord]:
     """Return the probes in an entry's folder, one for each seed that has one; damaged seeds count as having none."""
     if not store.path.is_dir():
         return []
-    found = []
+    records = []
     for seed in store.seeds():
         with contextlib.suppress(StoreError):
-            found.append(of_record(store.seed(seed).record() or {}))
-    return [probe for probe in found if probe is not None]
+            records.append(store.seed(seed).record())
+    return of_records(records)
 
 
-def sentence(probe: Mapping[str, Any]) -> str:
+def sentence(probe: ProbeRecord) -> str:
     """Describe the result and the cost of a probe that did not end the run."""
-    if probe["result"] != EQUAL:
-        return f"not probed: {probe.get('reason')}"
+    if probe.result != EQUAL:
+        return f"not probed: {probe.reason}"
     return (
-        f"probed: seed {probe.get('seed')} is the same alone, to the last bit, up to epoch {probe.get('epochs')} "
-        f"({probe.get('seconds')} s, {probe.get('cpu')} s of processor time)"
+        f"probed: seed {probe.seed} is the same alone, to the last bit, up to epoch {probe.epochs} "
+        f"({probe.seconds} s, {probe.cpu} s of processor time)"
     )
 
 
-def third_party(made_with: Mapping[str, Any]) -> bool:
+def third_party(origin: Provenance) -> bool:
     """Tell from a provenance whether code of others than this suite has part in the numbers."""
-    versions = made_with.get("versions")
-    return isinstance(versions, Mapping) and not set(versions) <= set(PACKAGES)
+    return not set(origin.versions) <= set(PACKAGES)
 
 
 def require_independent(store: EntryStore) -> None:
     """Refuse to go on with an entry whose seeds depend on each other, by a probe's result."""
     for probe in of_entry(store):
-        if probe["result"] == DIFFERS:
+        if probe.result == DIFFERS:
             raise refusal(store, probe)
 
 
-def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
+def refusal(store: EntryStore, probe: ProbeRecord) -> DependentSeedsError:
     """Return the error for seeds that depend on each other: how they do, likely causes, and the command to type."""
     identity = store.record().identity
     kind, name = (
@@ -73,8 +71,8 @@ def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
         f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None and not loaded.cell else ""
     )
     return DependentSeedsError(
-        f"seed {probe['seed']} depends on its company: trained alone in a fresh process, it differs from the same seed "
-        f"in a group in {probe.get('difference')}. So no seed is what it says, and boards leave the entry out. Likely "
+        f"seed {probe.seed} depends on its company: trained alone in a fresh process, it differs from the same seed "
+        f"in a group in {probe.difference}. So no seed is what it says, and boards leave the entry out. Likely "
         "causes: something that all agents of a process share (a global variable, a class attribute, a closure, a "
         "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
         "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "

@@ -6,14 +6,15 @@ import functools
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import qrlsuite
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.records import DeviceRecord, Provenance
 
 if TYPE_CHECKING:
     import torch
@@ -35,7 +36,7 @@ Where all are set alike, the name of the processor does not count, see `qrlsuite
 """
 
 
-def collect(distributions: Sequence[str], device: torch.device | None = None) -> dict[str, Any]:
+def collect(distributions: Sequence[str], device: torch.device | None = None) -> Provenance:
     """Return versions, device, processor, threads, git commit, and the variables that fixed instruction sets.
 
     Parameters
@@ -46,22 +47,22 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
         The device that trains the models; the processor by default.
     """
     versions = {name: version(name) for name in [*PACKAGES, *distributions]}
-    return {
-        "versions": {name: number for name, number in versions.items() if number is not None},
-        "python": platform.python_version(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "processor": processor(),
-        "device": {"kind": "cpu", "name": processor()} if device is None else _device(device),
-        "cores": os.cpu_count(),
-        "threads": 1,
-        "instructions": {name: os.environ[name] for name in INSTRUCTIONS if name in os.environ},
-        "commit": _commit(),
-    }
+    return Provenance(
+        versions={name: number for name, number in versions.items() if number is not None},
+        python=platform.python_version(),
+        system=f"{platform.system()} {platform.machine()}",
+        processor=processor(),
+        device=DeviceRecord(kind="cpu", name=processor()) if device is None else _device(device),
+        cores=os.cpu_count(),
+        threads=1,
+        instructions={name: os.environ[name] for name in INSTRUCTIONS if name in os.environ},
+        commit=_commit(),
+    )
 
 
-def of(entry: Entry, device: torch.device | None = None) -> dict[str, Any]:
+def of(entry: Entry, device: torch.device | None = None) -> Provenance:
     """Return `collect` of an entry's distributions, and the `numerics` of the suite's own parts, by role."""
-    return {**collect(entry.distributions(), device), "numerics": identity.numerics(entry)}
+    return collect(entry.distributions(), device).changed(numerics=identity.numerics(entry))
 
 
 def version(distribution: str) -> str | None:
@@ -77,56 +78,34 @@ def version(distribution: str) -> str | None:
         return None
 
 
-def device_kind(made_with: Mapping[str, Any]) -> str:
-    """Return the kind of device (`cpu`, `cuda`) in a result of `collect`; `cpu` in old records, which name none."""
-    device = made_with.get("device")
-    return str(device.get("kind", "cpu")) if isinstance(device, Mapping) else "cpu"
-
-
-def records(made_with: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the record of a published seed's last epochs, and records of earlier epochs that were made otherwise."""
-    before = made_with.get("before")
-    return [
-        made_with,
-        *(each for each in (before if isinstance(before, list) else []) if isinstance(each, dict)),
-    ]
-
-
-def versions(made: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
+def versions(origins: Iterable[Provenance]) -> dict[str, tuple[str, ...]]:
     """Return every version that occurs, by distribution; Python's under "python"."""
     by_package: dict[str, set[str]] = {}
-    for origin in made:
-        packages = origin.get("versions")
-        named = {**(packages if isinstance(packages, Mapping) else {}), "python": origin.get("python")}
-        for name, version in named.items():
-            if isinstance(version, str):
-                by_package.setdefault(str(name), set()).add(version)
+    for origin in origins:
+        for name, version in {**origin.versions, "python": origin.python}.items():
+            if version is not None:
+                by_package.setdefault(name, set()).add(version)
     return {name: tuple(sorted(by_package[name])) for name in sorted(by_package)}
 
 
-def texts(made: Iterable[Mapping[str, Any]], name: str) -> tuple[str, ...]:
-    """Return every text that stands under a name, sorted, each once."""
-    return tuple(sorted({value for origin in made if isinstance(value := origin.get(name), str)}))
+def distinct(texts: Iterable[str | None]) -> tuple[str, ...]:
+    """Return every text that is known, sorted, each once."""
+    return tuple(sorted({text for text in texts if text is not None}))
 
 
-def devices(made: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return every kind of device that occurs (`cpu`, `cuda`), sorted; a record that names none means the CPU."""
-    return tuple(sorted({device_kind(origin) for origin in made}))
-
-
-def gpus(made: Iterable[Mapping[str, Any]]) -> set[str]:
+def gpus(origins: Iterable[Provenance]) -> set[str]:
     """Return the names of every device that occurs but the CPU; the kind of one without a name."""
-    named = (origin["device"] for origin in made if device_kind(origin) != "cpu")
-    return {str(device.get("name") or device["kind"])[:80] for device in named}
+    devices = (origin.device for origin in origins if origin.device.kind != "cpu")
+    return {(device.name or device.kind)[:80] for device in devices}
 
 
-def _device(device: torch.device) -> dict[str, str]:
+def _device(device: torch.device) -> DeviceRecord:
     import torch
 
     if device.type != "cuda":
-        return {"kind": device.type, "name": processor()}
-    name = torch.cuda.get_device_name(device)
-    return {"kind": device.type, "name": name, "numba-cuda": version("numba-cuda") or "none"}
+        return DeviceRecord(kind=device.type, name=processor())
+    facts = {"name": torch.cuda.get_device_name(device), "numba-cuda": version("numba-cuda") or "none"}
+    return DeviceRecord.model_validate({"kind": device.type, **facts})
 
 
 def processor() -> str:

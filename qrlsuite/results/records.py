@@ -1,6 +1,9 @@
 """Records as types: who writes one builds it, who reads one gets it, and one that is damaged is refused here.
 
     entry.json     EntryRecord: what was run; of a published entry with `published`
+    run.json       RunRecord: one seed's run
+    epochs.jsonl   EpochLine: one epoch of a seed; epochs.parquet has the same in columns
+    timings.jsonl  TimingLine: how long that epoch took
 
 A record has the known keys of its file as attributes. `content` is all of it, in the order of the file, with keys of
 later versions: that is written again. A key that may be absent has a default, with which older records are read.
@@ -12,6 +15,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 import pydantic
 from pydantic import (
     AfterValidator,
@@ -30,6 +34,8 @@ from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import Task, TaskFile, digest
 
 FORMAT_VERSION = 1
+MEASURED = "measured"
+"""Before the name of a metric of the environment in an epoch's record: `measured.violations`."""
 
 
 def _one_line(text: str) -> str:
@@ -44,10 +50,15 @@ def _sorted_once(names: list[Any]) -> list[Any]:
     return names
 
 
+MOST = float(np.finfo(np.float32).max)
 Line = Annotated[str, AfterValidator(_one_line)]
 Count = Annotated[int, Field(strict=True, ge=0, lt=10**12)]
 Positive = Annotated[int, Field(strict=True, ge=1, lt=10**9)]
 Name = Annotated[str, Field(pattern=specs.WHOLE_NAME)]
+
+
+Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]
+Seconds = Annotated[float, Field(strict=True, ge=0, lt=1e12)]
 
 
 class Record(pydantic.BaseModel):
@@ -55,12 +66,13 @@ class Record(pydantic.BaseModel):
 
     Attributes
     ----------
-    what:
-        What the whole file is, for messages.
+    what, cure:
+        For messages: what the whole file is, and what to do where it is damaged.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, populate_by_name=True)
     what: ClassVar[str] = "a record"
+    cure: ClassVar[str] = "restore the file"
     _content: dict[str, Any] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="wrap")
@@ -81,7 +93,7 @@ class Record(pydantic.BaseModel):
         except RecursionError:
             problems = "too many nested tables"
         text = " ".join(problems.split())[:300]
-        raise StoreError(f"{source} is not {cls.what}: {text}; restore the file")
+        raise StoreError(f"{source} is not {cls.what}: {text}; {cls.cure}")
 
     @property
     def content(self) -> dict[str, Any]:
@@ -169,6 +181,56 @@ class EntryIdentity(Record):
     start: Annotated[str | None, Field(alias=notation.START, pattern=f"^(?:{START_FORM.pattern})$")] = None
 
 
+class DeviceRecord(Record):
+    """What models were trained on."""
+
+    kind: str = "cpu"
+    name: str | None = None
+
+
+class Provenance(Record):
+    """With what a seed was trained, see `qrlsuite.results.provenance`; never part of an identity.
+
+    Attributes
+    ----------
+    instructions:
+        The variables by which instruction sets were fixed.
+    commit:
+        Of the suite's own working copy.
+    numerics:
+        Of the parts that are the suite's, by role.
+    before:
+        Of a published seed: with what else its earlier epochs were made.
+    host:
+        Of a remote worker.
+    """
+
+    versions: dict[str, str] = {}
+    python: str | None = None
+    system: str | None = None
+    processor: str | None = None
+    device: DeviceRecord = DeviceRecord()
+    cores: int | None = None
+    threads: int | None = None
+    instructions: dict[str, str] = {}
+    commit: str | None = None
+    numerics: dict[str, int] = {}
+    before: list[Provenance] = []
+    host: str | None = None
+
+    @property
+    def without_host(self) -> Provenance:
+        """The record without the name of a machine."""
+        return type(self).model_validate(
+            {name: part for name, part in self.content.items() if name != "host"}
+        )
+
+    @property
+    def with_earlier(self) -> list[Provenance]:
+        """The record of a published seed's last epochs, and those of earlier ones that were made otherwise."""
+        return [self, *self.before]
+
+
 class ImportedRecord(Record):
     """From what curves of another program were made."""
 
@@ -188,6 +250,8 @@ class ProbeRecord(Record):
     ----------
     seed, epochs:
         The seed that was trained alone, and up to which epoch.
+    device, code:
+        The kind of device, and the digest of the code.
     difference:
         In what it differed.
     reason:
@@ -198,6 +262,8 @@ class ProbeRecord(Record):
 
     result: Literal["equal", "differs", "not probed"]
     seed: int | None = None
+    device: str | None = None
+    code: str | None = None
     epochs: int | None = None
     difference: str | None = None
     reason: str | None = None
@@ -210,7 +276,7 @@ class AgentsRecord(Record):
 
     sha256: str
     seeds: Annotated[list[Count], Field(min_length=1), AfterValidator(_sorted_once)]
-    provenance: list[dict[str, Any]] = []
+    provenance: list[Provenance] = []
 
 
 def _counted(parameters: dict[str, int]) -> dict[str, int]:
@@ -247,7 +313,7 @@ class PublishedRecord(Record):
     parameters: Annotated[dict[str, Count], AfterValidator(_counted)]
     core_hours: float | None = None
     circuit_executions: Count | None = None
-    provenance: Annotated[list[dict[str, Any]], Field(min_length=1)]
+    provenance: Annotated[list[Provenance], Field(min_length=1)]
     diverged: dict[str, Positive] = {}
     probe: Annotated[ProbeRecord, AfterValidator(_independent)] | None = None
     agents: AgentsRecord | None = None
@@ -376,3 +442,134 @@ class EntryRecord(CodedRecord):
                 f"(hash {self.hash}, now {entry.hash}): keep it for reading, and choose another folder with --runs"
             )
         return entry
+
+
+class RunRecord(CodedRecord):
+    """One seed's run: what is trained, how far it is, and with what it was made.
+
+    Attributes
+    ----------
+    plan:
+        Hash of the study with looks that trains it.
+    epochs:
+        Of the newest checkpoint that it was begun from while it is running, else all.
+    diverged:
+        The first epoch after which numbers of the agent were not finite.
+    imported:
+        From which file of another program.
+    agent:
+        False where it was imported without its agent.
+    """
+
+    what: ClassVar[str] = "a run's record"
+    cure: ClassVar[str] = "restore the file or delete the seed's folder"
+
+    plan: str | None = None
+    task: str
+    task_hash: str
+    entry: str
+    label: str = ""
+    algorithm: str = ""
+    algorithm_options: dict[str, Any] = {}
+    model: str = ""
+    family: str = ""
+    model_options: dict[str, Any] = {}
+    parameters: dict[str, Count] = {}
+    seed: Count
+    interactions_per_epoch: int | None = None
+    probe: ProbeRecord | None = None
+    status: Literal["running", "finished"]
+    epochs: Count
+    diverged: Positive | None = None
+    imported: dict[str, Any] = {}
+    agent: bool = True
+    provenance: list[Provenance] = []
+
+    @property
+    def finished(self) -> bool:
+        """Whether it reached the epochs that were asked for."""
+        return self.status == "finished"
+
+    @property
+    def begun(self) -> dict[str, Any]:
+        """What stays when the run goes on: the code that began it, and what a probe found."""
+        return {name: self.content[name] for name in ("code", "probe") if name in self.content}
+
+    def told(self, folder: Path, **more: Any) -> dict[str, Any]:
+        """Return what trackers are told: all but the version, and the seed's folder."""
+        content = {name: value for name, value in self.content.items() if name != "format_version"}
+        return {**content, "folder": str(folder), **more}
+
+
+class EpochLine(Record):
+    """One epoch of a seed. Further keys are metrics of training, and `measured.NAME` of the environment.
+
+    Attributes
+    ----------
+    scores:
+        Of the validation's episodes.
+    score:
+        Their mean, where nothing more was imported.
+    executions:
+        Circuit executions by name.
+    diverged:
+        Whether numbers of the agent were not finite after it.
+    measured:
+        Metrics of the environment by name, as tables have them.
+    """
+
+    model_config = pydantic.ConfigDict(extra="allow")
+    what: ClassVar[str] = "an epoch's record"
+    cure: ClassVar[str] = "restore the file or delete the seed's folder"
+
+    epoch: Positive
+    scores: Annotated[list[Number], Field(min_length=1)] | None = None
+    score: Number | None = None
+    executions: dict[str, Annotated[int, Field(strict=True, ge=0, lt=2**63)] | None] | None = None
+    diverged: bool | None = None
+    measured: dict[Name, Number | None] = {}
+
+    __pydantic_extra__: dict[str, Number | None]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name in self.model_extra or {}:
+            outer, dot, inner = name.partition(".")
+            if outer == MEASURED and dot and not specs.NAME.fullmatch(inner):
+                raise ValueError(f"{name!r} is not the name of a metric")
+        return self
+
+    @property
+    def mean(self) -> float:
+        """The mean of the scores."""
+        return (self.score or 0.0) if self.scores is None else sum(self.scores) / len(self.scores)
+
+
+class TimingLine(Record):
+    """A seed's share of the time that an epoch of its group took, and where and when.
+
+    Attributes
+    ----------
+    train, validate:
+        Seconds by the clock.
+    cpu:
+        Core-seconds of both; None where they were not recorded, as on a GPU.
+    group:
+        Seeds that were trained together.
+    """
+
+    what: ClassVar[str] = "a record of times"
+
+    epoch: Positive | None = None
+    train: Seconds | None = None
+    validate_: Annotated[Seconds | None, Field(alias="validate")] = None
+    cpu: Seconds | None = None
+    group: Positive = 1
+    host: str = ""
+    time: str = ""
+
+    @property
+    def spent(self) -> list[float]:
+        """Parts of the seed's core-seconds; by the clock, which other work stretches, without `cpu`."""
+        parts = (self.train, self.validate_) if self.cpu is None else (self.cpu,)
+        return [part for part in parts if part is not None]

@@ -33,7 +33,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results import provenance
-from qrlsuite.results.store import EntryStore, entries, read_lines, write_atomically
+from qrlsuite.results.store import EntryStore, entries, write_atomically
 
 SAMPLED_SEEDS = 8
 """Number of seeds of an entry whose timings are read; timings within a group hardly differ."""
@@ -278,15 +278,10 @@ def measure(store: EntryStore) -> Speed | None:
     """
     by_group: dict[int, list[float]] = {}
     for seed in store.seeds()[-SAMPLED_SEEDS:]:
-        for line in read_lines(store.seed(seed).timings)[1:]:
-            values = [line.get(name) for name in ("train", "validate")]
-            group = line.get("group", 1)
-            if (
-                isinstance(group, int)
-                and group > 0
-                and all(isinstance(v, int | float) and 0 <= v < 1e9 for v in values)
-            ):
-                by_group.setdefault(group, []).append(sum(values))  # type: ignore[arg-type]
+        with contextlib.suppress(StoreError):  # damaged times tell nothing
+            for line in store.seed(seed).times()[1:]:
+                if line.train is not None and line.validate_ is not None:
+                    by_group.setdefault(line.group, []).append(line.train + line.validate_)
     largest = max(by_group, default=1)
     seconds = by_group.get(largest, [])
     if not seconds or not statistics.median(seconds) > 0:

@@ -22,14 +22,13 @@ import errno
 import functools
 import itertools
 import json
-import math
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow
@@ -41,18 +40,25 @@ from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.results import genuine, parquet
-from qrlsuite.results.records import FORMAT_VERSION, EntryRecord
+from qrlsuite.results.records import (
+    FORMAT_VERSION,
+    MEASURED,
+    EntryRecord,
+    EpochLine,
+    Record,
+    RunRecord,
+    TimingLine,
+)
 from qrlsuite.specs import NAME
 from qrlsuite.statistics.grid import settled
 
-MEASURED = "measured"
-"""Before the name of a metric of the environment in an epoch's record: `measured.violations`."""
 _MARK = re.compile(r"@[0-9a-f]{8}")
 _SEED_FOLDER = re.compile(r"seed-(\d{4}|[1-9]\d{4,})", re.ASCII)
 MOST_AGENT_BYTES = 200_000_000
 """A file of parameters that is larger than this is not read."""
 
 Arrays = dict[str, NDArray[Any]]
+R = TypeVar("R", bound=Record)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -139,6 +145,11 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     return records
 
 
+def read_records(path: Path, kind: type[R]) -> list[R]:
+    """Read JSON lines of one type."""
+    return [kind.read(line, f"{path}, line {number}") for number, line in enumerate(read_lines(path), 1)]
+
+
 def read_arrays(path: Path, most: int = MOST_AGENT_BYTES) -> Arrays:
     """Read a safetensors file: arrays by name.
 
@@ -217,7 +228,7 @@ class SeedRun:
     Attributes
     ----------
     record:
-        `run.json`; empty if the run never began.
+        `run.json`; None where the run never began.
     scores:
         (T, validation episodes), one row per epoch; (T, 1), the means, for seeds imported from an export.
     seconds:
@@ -235,7 +246,7 @@ class SeedRun:
     """
 
     seed: int
-    record: Mapping[str, Any]
+    record: RunRecord | None
     scores: NDArray[np.float32 | np.float64]
     seconds: float
     executions: int
@@ -246,7 +257,7 @@ class SeedRun:
     @property
     def finished(self) -> bool:
         """Whether the run reached the epochs that were asked for."""
-        return self.record.get("status") == "finished"
+        return self.record is not None and self.record.finished
 
     @property
     def curve(self) -> NDArray[np.float64]:
@@ -272,30 +283,29 @@ class SeedStore:
         self.timings = path / "timings.jsonl"
         self.agent = path / "final.safetensors"
 
-    def record(self) -> dict[str, Any] | None:
+    def record(self) -> RunRecord | None:
         """Return `run.json`, or None where the run never began."""
         path = self.path / "run.json"
         genuine.require_no_link(self.path, path, self.lines, self.table, self.timings, self.agent)
         if not path.exists():
             return None
-        record = read_json(path)
-        epochs, parameters = record.get("epochs"), record.get("parameters", {})
-        made_with = record.get("provenance", [])
-        if not (
-            record.get("status") in ("running", "finished")
-            and _is_count(epochs)
-            and isinstance(parameters, dict)
-            and all(_is_count(count) for count in parameters.values())
-            and isinstance(made_with, list)
-            and all(isinstance(origin, dict) for origin in made_with)
-        ):
-            raise StoreError(f"{path} is not a run's record; restore the file or delete the seed's folder")
+        record = RunRecord.read(read_json(path), path)
         genuine.require_seed(self.path, self.seed, record, {} if self.of is None else self.of.names)
         return record
 
-    def write_record(self, content: Mapping[str, Any]) -> None:
+    def write_record(self, record: RunRecord) -> None:
         """Replace `run.json`."""
-        write_json(self.path / "run.json", content)
+        write_json(self.path / "run.json", record.content)
+
+    def trained_epochs(self) -> int:
+        """Return the epochs of the run; 0 where it never began."""
+        record = self.record()
+        return 0 if record is None else record.epochs
+
+    def finished(self, epochs: int = 0) -> bool:
+        """Return whether the run has finished, with that many epochs or more."""
+        record = self.record()
+        return record is not None and record.finished and record.epochs >= epochs
 
     def parameters(self) -> Arrays:
         """Return the trained agent's parameters by name."""
@@ -306,26 +316,24 @@ class SeedStore:
                 f"{self.agent} is missing: seed {self.seed} has a learning curve but no trained parameters (entries "
                 "that were imported may have none); train the entry here with `qrlsuite run`"
             ) from None
-        if (self.record() or {}).get("diverged") is None:
+        if (record := self.record()) is None or record.diverged is None:
             require_finite(arrays, self.agent)
         return arrays
 
-    def epochs(self, decimals: bool = True) -> list[dict[str, Any]]:
-        """Return every epoch's record in order: the table, then newer lines.
-
-        Parameters
-        ----------
-        decimals:
-            Whether scores are the shortest decimals, as in the lines. Otherwise scores of the table stay float32,
-            which saves most of the time.
-        """
-        rows = read_table(self.table, decimals) if self.table.exists() else []
-        last = _epoch(rows[-1], self.table) if rows else 0
-        rows += [line for line in read_lines(self.lines) if _epoch(line, self.lines) > last]
+    def epochs(self) -> list[EpochLine]:
+        """Return every epoch's record in order: the table, then newer lines."""
+        rows = self._table()
+        rows += [
+            line for line in read_records(self.lines, EpochLine) if not rows or line.epoch > rows[-1].epoch
+        ]
         for expected, row in enumerate(rows, start=1):
-            if _epoch(row, self.path) != expected:
-                raise StoreError(f"{self.path}: epoch {expected} is missing (found {row.get('epoch')!r})")
+            if row.epoch != expected:
+                raise StoreError(f"{self.path}: epoch {expected} is missing (found {row.epoch})")
         return rows
+
+    def _table(self) -> list[EpochLine]:
+        rows = read_table(self.table) if self.table.exists() else []
+        return [EpochLine.read(row, self.table) for row in rows]
 
     def cut(self, epoch: int) -> int:
         """Drop every line newer than an epoch, and torn last lines; a table newer than it becomes lines again.
@@ -339,24 +347,18 @@ class SeedStore:
             The number of remaining epochs: fewer than `epoch` if some are missing.
         """
         drop_torn_line(self.timings)
-        rows = self._contiguous(epoch)
-        last = int(read_table(self.table, decimals=False)[-1]["epoch"]) if self.table.exists() else 0
+        table, by_epoch = self._table(), dict[int, EpochLine]()
+        for row in (*table, *read_records(self.lines, EpochLine)):
+            by_epoch.setdefault(row.epoch, row)
+        numbers = itertools.takewhile(by_epoch.__contains__, range(1, epoch + 1))
+        rows, last = [by_epoch[number] for number in numbers], table[-1].epoch if table else 0
         if last > epoch:
-            write_atomically(self.lines, b"".join(json_line(row) for row in rows))
+            write_atomically(self.lines, b"".join(json_line(row.content) for row in rows))
             self.table.unlink()
         elif self.lines.exists():
-            write_atomically(self.lines, b"".join(json_line(row) for row in rows if row["epoch"] > last))
+            newer = (json_line(row.content) for row in rows if row.epoch > last)
+            write_atomically(self.lines, b"".join(newer))
         return len(rows)
-
-    def _contiguous(self, last: int) -> list[dict[str, Any]]:
-        """Return the record of each epoch from 1 to `last`, or to the epoch before the first missing one."""
-        by_epoch: dict[int, dict[str, Any]] = {}
-        table = read_table(self.table, True) if self.table.exists() else []
-        for path, rows in ((self.table, table), (self.lines, read_lines(self.lines))):
-            for row in rows:
-                by_epoch.setdefault(_epoch(row, path), row)
-        numbers = itertools.takewhile(by_epoch.__contains__, range(1, last + 1))
-        return [by_epoch[number] for number in numbers]
 
     def sync(self) -> None:
         """Force appended lines to the disk: called before a checkpoint that supersedes them is written."""
@@ -365,12 +367,22 @@ class SeedStore:
                 with path.open("rb") as file:
                     os.fsync(file.fileno())
 
-    def compact(self) -> None:
-        """Turn the lines into a table."""
+    def compact(self) -> list[EpochLine]:
+        """Turn the lines into a table; return all epochs."""
         rows = self.epochs()
         if rows and self.lines.exists():
-            write_atomically(self.table, table_bytes(rows))
+            write_atomically(self.table, table_bytes([row.content for row in rows]))
             self.lines.unlink(missing_ok=True)
+        return rows
+
+    def newest_epoch(self) -> int:
+        """Return the epoch of the newest line of a run that goes on; that of its record where there is none."""
+        lines = read_lines(self.lines)
+        return EpochLine.read(lines[-1], self.lines).epoch if lines else self.trained_epochs()
+
+    def times(self) -> list[TimingLine]:
+        """Return the times of every epoch."""
+        return read_records(self.timings, TimingLine)
 
     def seconds(self) -> float:
         """Return the core-seconds spent on this seed's epochs so far: its share of the group's time.
@@ -382,96 +394,100 @@ class SeedStore:
 
     def _timed(self) -> tuple[float, bool]:
         """Return the core-seconds, and whether some of them are by the clock."""
-        total, clocked = 0.0, False
-        for line in read_lines(self.timings):
-            clocked |= "cpu" not in line
-            for name in ("cpu",) if "cpu" in line else ("train", "validate"):
-                value = line.get(name, 0.0)
-                if not isinstance(value, int | float) or not 0 <= value < 1e12:
-                    raise StoreError(f"{self.timings}: {name} = {value!r} is not a number of seconds")
-                total += value
-        return total, clocked
+        lines, total = self.times(), 0.0
+        for seconds in (seconds for line in lines for seconds in line.spent):
+            total += seconds
+        return total, any(line.cpu is None for line in lines)
 
     def read(self) -> SeedRun:
         """Return the content of the run so far."""
-        rows = self.epochs(decimals=False)
-        try:
-            with np.errstate(over="ignore"):
-                scores: NDArray[Any]
-                if rows and "score" in rows[0] and "scores" not in rows[0]:
-                    scores = np.array([[row["score"]] for row in rows], dtype=np.float64)
-                else:
-                    scores = np.array([row["scores"] for row in rows], dtype=np.float32)
-        except (KeyError, TypeError, ValueError, OverflowError):
-            raise StoreError(f"{self.path}: an epoch has no list of validation scores") from None
-        if rows and (scores.ndim != 2 or scores.shape[1] == 0 or not np.isfinite(scores).all()):
-            raise StoreError(f"{self.path}: validation scores must be finite and equally many in every epoch")
-        record = self.record() or {}
-        if record.get("status") == "finished" and len(rows) < int(record["epochs"]):
+        columns = self._columns()
+        record, epochs = self.record(), columns.num_rows
+        if record is not None and record.finished and epochs < record.epochs:
             raise StoreError(
-                f"{self.path} finished {record['epochs']} epochs and holds {len(rows)}: restore the file or delete "
+                f"{self.path} finished {record.epochs} epochs and holds {epochs}: restore the file or delete "
                 "the seed's folder"
             )
-        shaped = scores if rows else np.empty((0, 0), np.float32)
+        scores = _scores(columns, self.path) if epochs else np.empty((0, 0), np.float32)
         seconds, clocked = self._timed()
-        executions = self._executions(rows)
-        first = first_diverged(rows)
-        measured = self._measured(rows)
-        return SeedRun(self.seed, record, shaped, seconds, executions, clocked, first, measured)
+        counts, measured = 0, dict[str, NDArray[np.float64]]()
+        for name in columns.column_names:
+            outer, _, inner = name.partition(".")
+            if outer == "executions" and inner != "shots":
+                counts += _count(columns[name].to_pylist(), self.path)
+            elif outer == MEASURED:
+                measured[inner] = _metric(inner, columns[name], self.path)
+        diverged = columns["diverged"].to_pylist() if "diverged" in columns.column_names else []
+        first = diverged.index(True) + 1 if True in diverged else None
+        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured)
 
-    def _measured(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
-        """Return the metrics of every epoch's validation, (T,) by name; NaN where an epoch has none."""
-        found: dict[str, NDArray[np.float64]] = {}
-        for place, row in enumerate(rows):
-            for name, value in _metrics(row):
-                known = value is None or (type(value) in (int, float) and math.isfinite(value))
-                if not known or not NAME.fullmatch(name):
-                    raise StoreError(f"{self.path}: {ascii(name)[:40]} = {ascii(value)[:40]} is no metric")
-                own = found.setdefault(name, np.full(len(rows), np.nan))
-                own[place] = np.nan if value is None else value
-        return found
-
-    def _executions(self, rows: Sequence[Mapping[str, Any]]) -> int:
-        total = 0
-        for row in rows:
-            counts = row.get("executions")
-            for name, count in counts.items() if isinstance(counts, Mapping) else ():
-                if count is None or name == "shots":
-                    continue
-                if not _is_count(count) or count >= 2**63:
-                    raise StoreError(f"{self.path}: {count!r} is not a number of circuit executions")
-                total += count
-        return total
-
-
-def _metrics(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Return names and values of an epoch's metrics: `measured.NAME` of a line, a mapping in a table."""
-    for name, value in row.items():
-        if name == MEASURED and isinstance(value, Mapping):
-            yield from value.items()
-        elif name.startswith(f"{MEASURED}."):
-            yield name.partition(".")[2], value
+    def _columns(self) -> pyarrow.Table:
+        """Return all epochs as columns: of the table, with newer lines behind them."""
+        parts = [parquet.read(self.table)] if self.table.exists() else []
+        last = parts[0].num_rows if parts else 0
+        lines = [line.content for line in read_records(self.lines, EpochLine) if line.epoch > last]
+        try:
+            columns = pyarrow.concat_tables([*parts, table_of(lines)], promote_options="permissive")
+            numbers = columns["epoch"].to_pylist() if columns.num_rows else []
+        except (pyarrow.ArrowException, KeyError) as error:
+            raise StoreError(
+                f"{self.path} does not hold epochs ({_first_line(error)}); restore the file or delete the folder"
+            ) from None
+        for expected, number in enumerate(numbers, start=1):
+            if number != expected:
+                raise StoreError(f"{self.path}: epoch {expected} is missing (found {number!r})")
+        return columns
 
 
-def first_diverged(rows: Iterable[Mapping[str, Any]]) -> int | None:
-    """Return the first epoch after which numbers of the agent were not finite; None where they always were."""
-    return next((int(row["epoch"]) for row in rows if row.get("diverged") is True), None)
+def _scores(columns: pyarrow.Table, path: Path) -> NDArray[np.float32 | np.float64]:
+    """Return validation scores (T, episodes), or their means (T, 1)."""
+    name = "scores" if "scores" in columns.column_names else "score"
+    try:
+        column = columns[name].combine_chunks()
+        if name == "score":
+            means: NDArray[np.float64] = np.asarray(column.cast(pyarrow.float64()).to_numpy(False))[:, None]
+            values: NDArray[np.float32 | np.float64] = means
+        else:
+            with np.errstate(over="ignore"):
+                flat = np.asarray(column.flatten().to_numpy(False), np.float32)
+            lengths = set(column.value_lengths().to_pylist())
+            values = flat.reshape(len(column), -1) if len(lengths) == 1 else np.empty((0, 0), np.float32)
+    except (KeyError, AttributeError, TypeError, ValueError):
+        raise StoreError(f"{path}: an epoch has no list of validation scores") from None
+    if not values.size or not np.isfinite(values).all():
+        raise StoreError(f"{path}: validation scores must be finite and equally many in every epoch")
+    return values
 
 
-def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+def _count(counts: Sequence[Any], path: Path) -> int:
+    """Return the sum of circuit executions; an epoch without has None."""
+    known = [count for count in counts if count is not None]
+    if not all(type(count) is int and count >= 0 for count in known):
+        raise StoreError(f"{path}: {str(known)[:80]} are not numbers of circuit executions")
+    return sum(known)
+
+
+def _metric(name: str, column: pyarrow.ChunkedArray, path: Path) -> NDArray[np.float64]:
+    """Return a metric of every epoch's validation (T,); NaN where an epoch has none."""
+    try:
+        values = np.asarray(column.cast(pyarrow.float64()).to_numpy(), np.float64)
+    except pyarrow.ArrowException:
+        values = np.full(1, np.inf)
+    if np.isinf(values).any() or not NAME.fullmatch(name):
+        raise StoreError(f"{path}: {ascii(name)[:40]} is no metric")
+    return values
+
+
+def parameters_of(records: Iterable[RunRecord | None]) -> dict[str, int]:
     """Return the trainable numbers of an entry's agents, from the `run.json` of its seeds.
 
     `classical` and `quantum` are summed over all trained networks, `networks` in number; `fixed` counts numbers of
     these networks that stay as drawn, if any. Records without `networks` are of older versions, which counted the first
     network alone; they count only if there is no newer record.
     """
-    per_run = [dict(record.get("parameters", {})) for record in records]
+    per_run = [{} if record is None else record.parameters for record in records]
     whole = [counts for counts in per_run if "networks" in counts]
     return next(iter([*whole, *per_run]), {})
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def _steps(tuning: EntryTuning | None) -> int:
@@ -481,29 +497,27 @@ def _steps(tuning: EntryTuning | None) -> int:
     return -1 if tuning.steps is None else tuning.steps
 
 
-def _epoch(row: Mapping[str, Any], path: Path) -> int:
-    epoch = row.get("epoch")
-    if not isinstance(epoch, int) or epoch < 1:
-        raise StoreError(f"{path}: a record has epoch {epoch!r}")
-    return epoch
-
-
 def table_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
     """Encode epoch records as parquet: one row per epoch, nested values as their own columns."""
-    columns: dict[str, list[Any]] = {}
-    flat = [_flatten(row) for row in rows]
-    for name in sorted({name for row in flat for name in row}):
-        columns[name] = [row.get(name) for row in flat]
-    arrays = {
-        name: pyarrow.array(values, pyarrow.list_(pyarrow.float32()))
-        if name == "scores"
-        else pyarrow.array(values)
-        for name, values in columns.items()
-    }
     sink = pyarrow.BufferOutputStream()
-    pyarrow.parquet.write_table(pyarrow.table(arrays), sink, compression="zstd")
+    pyarrow.parquet.write_table(table_of(rows), sink, compression="zstd")
     result: bytes = sink.getvalue().to_pybytes()
     return result
+
+
+def table_of(rows: Sequence[Mapping[str, Any]]) -> pyarrow.Table:
+    """Return epoch records as columns, which `table_bytes` encodes."""
+    flat = [_flatten(row) for row in rows]
+    columns = {
+        name: [row.get(name) for row in flat] for name in sorted({name for row in flat for name in row})
+    }
+    of_scores = pyarrow.list_(pyarrow.float32())
+    return pyarrow.table(
+        {
+            name: pyarrow.array(values, of_scores if name == "scores" else None)
+            for name, values in columns.items()
+        }
+    )
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -516,17 +530,11 @@ def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
-    """Read a table that `table_bytes` encoded.
-
-    Parameters
-    ----------
-    decimals:
-        See `SeedStore.epochs`.
-    """
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """Read a table that `table_bytes` encoded, one mapping a row, with scores as the shortest decimals."""
     table = parquet.read(path)
     try:
-        columns = [_column(table, name, decimals) for name in table.column_names]
+        columns = [_column(table, name) for name in table.column_names]
         rows = [_nest(dict(zip(table.column_names, values))) for values in zip(*columns)]
     except (TypeError, ValueError, OverflowError):  # columns of other types than `table_bytes` writes
         raise StoreError(
@@ -537,13 +545,12 @@ def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     return rows
 
 
-def _column(table: pyarrow.Table, name: str, decimals: bool) -> list[Any]:
-    """Return a column's values, one a row; lists of scores are numpy arrays, or with `decimals` as in the lines."""
+def _column(table: pyarrow.Table, name: str) -> list[Any]:
+    """Return a column's values, one a row."""
     if name != "scores":
         values: list[Any] = table[name].to_pylist()
         return values
-    arrays = table[name].to_numpy()
-    return [shortest(array) if decimals and array is not None else array for array in arrays]
+    return [None if array is None else shortest(array) for array in table[name].to_numpy()]
 
 
 def _first_line(error: Exception) -> str:
@@ -676,12 +683,7 @@ class EntryStore:
 
     def finished(self, seeds: Iterable[int], epochs: int) -> set[int]:
         """Return which of the seeds have completed that many epochs."""
-        done = set()
-        for seed in seeds:
-            record = self.seed(seed).record()
-            if record and record.get("status") == "finished" and int(record.get("epochs", 0)) >= epochs:
-                done.add(seed)
-        return done
+        return {seed for seed in seeds if self.seed(seed).finished(epochs)}
 
 
 def copies_of_plugins(store: EntryStore, record: EntryRecord) -> str:

@@ -17,7 +17,7 @@ from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living, m
 from qrlsuite.results.progress import read_progress
 from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, read_lines, write_json
+from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, write_json
 from qrlsuite.results.text import duration
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
@@ -91,10 +91,10 @@ def outline(store: EntryStore) -> dict[str, Any]:
     """Return an entry's options and the distinct provenances of its seeds, as plain values."""
     record = store.record()
     seeds = store.seeds()
-    records = [store.seed(seed).record() or {} for seed in seeds]
+    records = [store.seed(seed).record() for seed in seeds]
     made_with: list[Any] = []
-    for run in records:
-        made_with += [provenance for provenance in run.get("provenance", []) if provenance not in made_with]
+    for origin in (origin.content for run in records if run is not None for origin in run.provenance):
+        made_with += [origin] if origin not in made_with else []
     return {
         "label": record.label,
         "name": record.name,
@@ -124,11 +124,8 @@ def _seeds(
     for seed in store.seeds():
         folder = store.seed(seed)
         try:
-            record = folder.record() or {}
-            finished = record.get("status") == "finished"
-            lines = [] if finished else read_lines(folder.lines)
-            newest = lines[-1].get("epoch") if lines else record.get("epochs", 0)
-            epochs.append(newest if isinstance(newest, int) else 0)
+            finished = folder.finished()
+            epochs.append(folder.trained_epochs() if finished else folder.newest_epoch())
         except StoreError as error:
             statuses[seed] = "damaged"
             problems.append(str(error))
@@ -290,12 +287,10 @@ def _finished(store: EntryStore) -> tuple[set[int], set[int]]:
     done, damaged = set(), set()
     for seed in store.seeds():
         try:
-            record = store.seed(seed).record() or {}
+            if store.seed(seed).finished():
+                done.add(seed)
         except StoreError:
             damaged.add(seed)
-            continue
-        if record.get("status") == "finished":
-            done.add(seed)
     return done, damaged
 
 

@@ -292,11 +292,11 @@ class StudyWithLooks:
         for seed in store.seeds() if store.path.is_dir() else []:
             folder = store.seed(seed)
             record = folder.record()
-            if record and record.get("status") == "finished" and int(record.get("epochs", 0)) >= self.epochs:
+            if record is not None and record.finished and record.epochs >= self.epochs:
                 run = folder.read()
-                yield Run(seed, record.get("plan"), run.curve[: self.epochs], run.seconds / 3600)
+                yield Run(seed, record.plan, run.curve[: self.epochs], run.seconds / 3600)
             else:
-                yield Run(seed, record.get("plan") if record else self.hash, None, folder.seconds() / 3600)
+                yield Run(seed, self.hash if record is None else record.plan, None, folder.seconds() / 3600)
 
     def read(self) -> StudyState:
         """Read the folder once, and decide by it; writes nothing."""

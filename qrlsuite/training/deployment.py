@@ -151,7 +151,7 @@ class Deployment:
             "format_version": 1,
             "model": self.entry.model.name,
             "model_options": options.plain(self.entry.model_options),
-            "epochs": [int((store.seed(seed).record() or {})["epochs"]) for seed in self.seeds],
+            "epochs": [store.seed(seed).trained_epochs() for seed in self.seeds],
             "agents": self.seeds,
         }
         if entry.task.hash != store.record().task_hash:

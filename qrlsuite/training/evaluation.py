@@ -115,13 +115,11 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
     """
     if count < 1:
         raise OptionError(f"--best {count}: at least one run is needed")
-    records = {seed: store.seed(seed).record() or {} for seed in store.seeds()}
-    lengths = {
-        seed: int(record["epochs"]) for seed, record in records.items() if record.get("status") == "finished"
-    }
-    longest = max(lengths.values(), default=0)
+    records = {seed: store.seed(seed).record() for seed in store.seeds()}
+    finished = {seed: record for seed, record in records.items() if record is not None and record.finished}
+    longest = max((record.epochs for record in finished.values()), default=0)
     last: dict[int, float] = {}
-    for seed in sorted(seed for seed, epochs in lengths.items() if epochs == longest):
+    for seed in sorted(seed for seed, record in finished.items() if record.epochs == longest):
         curve = store.seed(seed).read().curve
         if len(curve):
             last[seed] = float(curve[-1])
@@ -129,7 +127,7 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
         raise StoreError(
             f"{store.path}: no run has finished, so there is no trained agent; `qrlsuite run` finishes them"
         )
-    published = {seed: score for seed, score in last.items() if records[seed].get("agent") is not False}
+    published = {seed: score for seed, score in last.items() if finished[seed].agent}
     last = published or last
     most = -1 if store.record().task_file.score.goal == "below" else 1
     chosen = sorted(last, key=lambda seed: (-most * last[seed], seed))[:count]

@@ -22,6 +22,14 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import checkpoint, codes, probes, provenance, store
+from qrlsuite.results.records import (
+    MEASURED,
+    EpochLine,
+    ProbeRecord,
+    Provenance,
+    RunRecord,
+    TimingLine,
+)
 from qrlsuite.training.interrupts import Interruptible
 from qrlsuite.training.trackers import EventSink, asked
 from qrlsuite.training.trainer import Epoch, Report, Trainer
@@ -35,19 +43,19 @@ class GroupProbe(Protocol):
     def begin(self, trainer: Trainer) -> bool:
         """Look at a training before its first epoch; returns whether `judge` can be called."""
 
-    def add(self, trainer: Trainer, lines: Sequence[Mapping[str, Any]], state: checkpoint.Arrays) -> bool:
+    def add(self, trainer: Trainer, lines: Sequence[EpochLine], state: checkpoint.Arrays) -> bool:
         """Add an epoch; returns whether `judge` can be called."""
 
-    def judge(self) -> dict[str, Any]:
+    def judge(self) -> ProbeRecord:
         """Return the value of `probe` in `run.json`."""
 
 
-def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
+def lines_of(epoch: Epoch) -> list[EpochLine]:
     """Return the record of an epoch as plain values: one line of `epochs.jsonl` for each seed."""
     lines = []
     for s, scores in enumerate(epoch.scores):
         line: dict[str, Any] = {"epoch": epoch.number, "scores": store.shortest(scores)}
-        measured = {f"{store.MEASURED}.{name}": values for name, values in epoch.measured.items()}
+        measured = {f"{MEASURED}.{name}": values for name, values in epoch.measured.items()}
         for name, values in {**epoch.metrics, **measured}.items():
             value = float(values[s])
             line[name] = value if math.isfinite(value) else None
@@ -55,15 +63,16 @@ def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
             line["executions"] = epoch.executions[s]
         if epoch.diverged[s]:
             line["diverged"] = True
-        lines.append(line)
+        lines.append(EpochLine.model_validate(line))
     return lines
 
 
-def timing_of(epoch: Epoch, seeds: int) -> dict[str, Any]:
+def timing_of(epoch: Epoch, seeds: int) -> TimingLine:
     """Return a seed's line of `timings.jsonl` for an epoch of a group: the seed's share of the time, where and when."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     timing = {name: round(value / seeds, 6) for name, value in epoch.seconds.items()}
-    return {"epoch": epoch.number, **timing, "group": seeds, "host": socket.gethostname(), "time": now}
+    where = {"group": seeds, "host": socket.gethostname(), "time": now}
+    return TimingLine.model_validate({"epoch": epoch.number, **timing, **where})
 
 
 class GroupFiles:
@@ -102,10 +111,10 @@ class GroupFiles:
         epoch, arrays = checkpoint.load(self.store, self.seeds)
         for seed in self.seeds:
             folder = self.store.seed(seed)
-            old = folder.record() or {}
-            if epoch < int(old.get("epochs", 0)) and old.get("status") == "finished":
+            old = folder.record()
+            if old is not None and old.finished and epoch < old.epochs:
                 raise StoreError(
-                    f"{folder.path} finished {old['epochs']} epochs and its checkpoint is gone: it cannot be "
+                    f"{folder.path} finished {old.epochs} epochs and its checkpoint is gone: it cannot be "
                     "extended; choose another folder with --runs DIR, or delete the seed's folder to start again"
                 )
             if (held := folder.cut(epoch)) < epoch:
@@ -118,7 +127,7 @@ class GroupFiles:
             arrays = self.store.initial(self.seeds)
         return epoch, arrays
 
-    def begin(self, epoch: int, parameters: Mapping[str, int], origin: Mapping[str, Any]) -> None:
+    def begin(self, epoch: int, parameters: Mapping[str, int], origin: Provenance) -> None:
         """Write `run.json` of every seed: it is being trained from an epoch on.
 
         Parameters
@@ -131,38 +140,36 @@ class GroupFiles:
         self.parameters = dict(parameters)
         for seed in self.seeds:
             folder = self.store.seed(seed)
-            old = folder.record() or {}
+            old = folder.record()
             begun: dict[str, Any] = {"code": self.code.record()} if epoch == 0 else {}
-            kept: dict[str, Any] = {name: old[name] for name in ("code", "probe") if name in old}
-            record = {
-                **self._seed_record(seed),
-                **kept,
-                "status": "running",
-                "epochs": epoch,
-                **begun,
-                "provenance": _with_origin(old, origin),
-            }
+            record = RunRecord.model_validate(
+                {
+                    **self._seed_record(seed),
+                    **({} if old is None else old.begun),
+                    "status": "running",
+                    "epochs": epoch,
+                    **begun,
+                    "provenance": _with_origin(old, origin),
+                }
+            )
             folder.write_record(record)
-            history = folder.epochs() if self.events.heard("run_started") else []
-            self.events.send("run_started", run={**record, "folder": str(folder.path), "history": history})
+            history = [line.content for line in folder.epochs()] if self.events.heard("run_started") else []
+            self.events.send("run_started", run=record.told(folder.path, history=history))
 
-    def add_origin(self, origin: Mapping[str, Any]) -> None:
+    def add_origin(self, origin: Provenance) -> None:
         """Note in `run.json` of every seed where else it is trained."""
         for seed in self.seeds:
             folder = self.store.seed(seed)
-            record = folder.record() or {}
-            made_with = _with_origin(record, origin)
-            if made_with != record.get("provenance"):
-                del record["format_version"]
-                folder.write_record({**record, "provenance": made_with})
+            record = folder.record()
+            if record is not None and origin not in record.provenance:
+                folder.write_record(record.changed(provenance=_with_origin(record, origin)))
 
-    def add_probe(self, probe: Mapping[str, Any]) -> None:
+    def add_probe(self, probe: ProbeRecord) -> None:
         """Note in `run.json` of every seed what a probe found."""
         for seed in self.seeds:
             folder = self.store.seed(seed)
-            record = folder.record() or {}
-            del record["format_version"]
-            folder.write_record({**record, "probe": dict(probe)})
+            if (record := folder.record()) is not None:
+                folder.write_record(record.changed(probe=probe))
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
         planned = {} if self.entry.plan is None else {"plan": self.entry.plan}
@@ -182,7 +189,7 @@ class GroupFiles:
             "interactions_per_epoch": self.entry.task.file.protocol.interactions,
         }
 
-    def record(self, lines: Sequence[Mapping[str, Any]], timing: Mapping[str, Any]) -> None:
+    def record(self, lines: Sequence[EpochLine], timing: TimingLine) -> None:
         """Append an epoch's line and timing to every seed, and send the line to the trackers.
 
         Parameters
@@ -190,13 +197,13 @@ class GroupFiles:
         lines:
             One for each seed, see `lines_of`.
         """
-        timing_line = store.json_line(timing)
+        timing_line = store.json_line(timing.content)
         for seed, line in zip(self.seeds, lines):
             folder = self.store.seed(seed)
-            store.append(folder.lines, store.json_line(line))
+            store.append(folder.lines, store.json_line(line.content))
             store.append(folder.timings, timing_line)
             run = {**self._seed_record(seed), "folder": str(folder.path)}
-            self.events.send("epoch_finished", run=run, record=line)
+            self.events.send("epoch_finished", run=run, record=line.content)
 
     def save(self, epoch: int, arrays: checkpoint.Arrays) -> None:
         """Write the checkpoint of an epoch, if it is newer than the one on disk."""
@@ -213,23 +220,17 @@ class GroupFiles:
             folder = self.store.seed(seed)
             agent = {name: np.ascontiguousarray(array[s]) for name, array in policy.items()}
             store.write_atomically(folder.agent, encode(agent))
-            folder.compact()
-            record = {
-                **(folder.record() or self._seed_record(seed)),
-                "status": "finished",
-                "epochs": epoch,
-            }
-            diverged = store.first_diverged(folder.epochs(decimals=False))
-            if diverged is not None:
-                record["diverged"] = diverged
-            del record["format_version"]
+            diverged = next((line.epoch for line in folder.compact() if line.diverged), None)
+            noted = {} if diverged is None else {"diverged": diverged}
+            content = self._seed_record(seed) if (begun := folder.record()) is None else begun.content
+            record = RunRecord.model_validate({**content, "status": "finished", "epochs": epoch, **noted})
             folder.write_record(record)
-            self.events.send("run_finished", run={**record, "folder": str(folder.path)})
+            self.events.send("run_finished", run=record.told(folder.path))
 
 
-def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[Any]:
-    made_with = [*record.get("provenance", [])]
-    return made_with if origin in made_with else [*made_with, origin]
+def _with_origin(record: RunRecord | None, origin: Provenance) -> list[Provenance]:
+    origins = [] if record is None else record.provenance
+    return origins if origin in origins else [*origins, origin]
 
 
 Part = tuple[Entry, store.EntryStore, Sequence[int]]
@@ -291,7 +292,7 @@ class GroupRun:
         self.files = [GroupFiles(*part, events, code) for part, code in zip(parts, found)]
         self.progress.epochs, self.progress.warnings = epochs, events.problems
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
-        self._lines: list[dict[str, Any]] = []
+        self._lines: list[EpochLine] = []
 
     def run(self) -> None:
         """Train to the last epoch; on an interruption, save the last finished epoch and raise it again."""
@@ -369,7 +370,7 @@ class GroupRun:
         with guard.deferred():
             for files in self.files:
                 files.add_probe(found)
-        if found["result"] == probes.DIFFERS:
+        if found.result == probes.DIFFERS:
             middle = self.trainer.S // 2
             raise probes.refusal(next(f.store for f, places in self.parts() if middle < places.stop), found)
 

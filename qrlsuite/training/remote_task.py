@@ -199,7 +199,7 @@ def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tup
         trainer = Trainer(entry, seeds, header["device"])
         more["parameters"] = trainer.models.trained()
         origin = provenance.of(entry, trainer.device)
-        more["provenance"] = {**origin, "host": socket.gethostname()}
+        more["provenance"] = origin.changed(host=socket.gethostname()).content
         if header["epoch"]:
             trainer.restore(header["epoch"], arrays)
         else:
@@ -209,8 +209,8 @@ def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tup
         while trainer.epoch < header["epochs"]:
             epoch = trainer.train_epoch()
             answered = trainer.capture()
-            lines.append(lines_of(epoch))
-            timings.append(timing_of(epoch, len(seeds)))
+            lines.append([line.content for line in lines_of(epoch)])
+            timings.append(timing_of(epoch, len(seeds)).content)
             more["epoch"] = epoch.number
             if time.monotonic() - began >= header["seconds"]:
                 break

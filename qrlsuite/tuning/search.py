@@ -367,7 +367,8 @@ class Search(Shown):
         own = {(entry.hash, seed): store.seed(seed).seconds() for seed in seeds}
         self._seconds |= own
         for seed in seeds:
-            self._gpus |= provenance.gpus((store.seed(seed).record() or {}).get("provenance", []))
+            if (record := store.seed(seed).record()) is not None:
+                self._gpus |= provenance.gpus(record.provenance)
         spent = sum(own.values())
         spread = self._spread(curves, worth)
         trial = Trial(
@@ -431,7 +432,7 @@ class Search(Shown):
                 runs=self.runs_done,
                 epochs=self.epochs,
                 steps=self.runs_done * self.steps_per_run,
-                versions=dict(provenance.collect([*plugins, *extra])["versions"]),
+                versions=provenance.collect([*plugins, *extra]).versions,
                 core_hours=float(f"{self.core_seconds / 3600:.3g}"),
                 **{**how, "note": "; ".join(notes) or None},
             ),

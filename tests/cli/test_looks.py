@@ -29,6 +29,7 @@ from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.leaderboard.report import looks as looks_report
+from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies.outcome import needs_text
@@ -60,9 +61,8 @@ def put(store: EntryStore, seed: int, epochs: int, start: int) -> None:
     timings = [json_line({"epoch": t, "cpu": 36 / epochs}) for t in range(1, epochs + 1)]
     folder.timings.write_bytes(b"".join(timings))
     entry = store.entry()
-    record = {**({"plan": entry.plan} if entry.plan else {}), "seed": seed, **store.names, "parameters": {}}
-    record |= {"code": identity.of(entry).record(), "provenance": [], "status": "finished", "epochs": epochs}
-    folder.write_record(record)
+    record = RunRecord(plan=entry.plan, seed=seed, **store.names, status="finished", epochs=epochs)
+    folder.write_record(record.changed(code=identity.of(entry).record()))
 
 
 class Scripted:

@@ -10,6 +10,7 @@ import pytest
 
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from tests.commands import say
 from tests.conftest import TINY
@@ -27,8 +28,7 @@ def put(width: int, *starts: int, epochs: int = EPOCHS) -> None:
         folder.table.write_bytes(table_bytes(rows))
         times = {"train": 0.4, "validate": 0.1, "group": 1}
         folder.timings.write_bytes(b"".join(json_line({"epoch": t, **times}) for t in range(1, epochs + 1)))
-        record = {"status": "finished", "epochs": epochs, "parameters": {}, "provenance": []}
-        folder.write_record({"seed": seed, **store.names, **record})
+        folder.write_record(RunRecord(seed=seed, **store.names, status="finished", epochs=epochs))
 
 
 @pytest.fixture(autouse=True)

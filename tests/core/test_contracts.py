@@ -153,7 +153,7 @@ def test_what_an_environment_measures_is_recorded() -> None:
     np.testing.assert_array_equal(epoch.measured["steps-taken"], lengths.mean(1))
     np.testing.assert_array_equal(epoch.measured["late"], np.where((lengths > 8).any(1), 1.0, np.nan))
     for line, steps in zip(lines_of(epoch), lengths.mean(1)):
-        assert line["measured.steps-taken"] == steps
+        assert line.content["measured.steps-taken"] == steps
     wrong = Trainer(entry("measured=Steps taken"), [0])
     wrong.start()
     with pytest.raises(

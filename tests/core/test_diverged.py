@@ -27,27 +27,25 @@ def test_seeds_that_diverge_are_recorded_from_the_epoch_on_and_keep_their_scores
     assert run.diverged == 1
     assert run.scores.shape[0] == 3
     assert EntryStore(sound).seed(0).read().diverged is None
-    assert "diverged" not in EntryStore(sound).seed(0).epochs()[0]
+    assert "diverged" not in EntryStore(sound).seed(0).epochs()[0].content
     monkeypatch.setattr(group, "CHECKPOINT_SECONDS", 0.0)
     train("stopped", [0, 1], 2, settings=TOO_FAST)
     stopped = train("stopped", [0, 1], 3, settings=TOO_FAST)
     assert results(entry, 1) == results(stopped, 1), "as never stopped"
-    assert [
-        (EntryStore(path).seed(0).record() or {}).get("diverged") for path in (entry, stopped, sound)
-    ] == [1, 1, None]
+    assert [EntryStore(path).seed(0).record().diverged for path in (entry, stopped, sound)] == [1, 1, None]
     loaded = api.load("mlp width=16 lr=1e+30", runs=tmp_path / "straight")
     assert loaded.diverged == (0, 1)
     assert "2, 2 diverged" in loaded.facts["seeds"]
     probe = {"result": "equal", "seed": 1, "epochs": 1}
     probed = EntryStore(entry).seed(1)
-    probed.write_record({**(probed.record() or {}), "probe": {**probe, "host": "mine"}})
+    probed.write_record(probed.record().changed(probe={**probe, "host": "mine"}))
     folder = export(loaded, tmp_path / "export")
     there = published.read(folder)
-    assert (there.entry_results().diverged, there.probe) == ((0, 1), probe)
+    assert (there.entry_results().diverged, there.published.probe.content) == ((0, 1), probe)
     import_seeds.import_seeds(EntryStore(folder), tmp_path / "imported")
     (here,) = (tmp_path / "imported").glob("*/*")
     assert EntryStore(here).seed(0).read().diverged == 1
-    assert (EntryStore(here).seed(1).record() or {})["probe"] == probe
+    assert EntryStore(here).seed(1).record().probe.content == probe
 
 
 def test_the_end_of_a_run_and_the_board_say_it(tiny_task: str, tmp_path: Path) -> None:

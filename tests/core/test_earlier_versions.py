@@ -88,7 +88,7 @@ def test_runs_end_as_they_did(run: Path, begun: bool, tmp_path: Path) -> None:
         ended = EntryStore(folder).seed(seed)
         expected = version / "finished" / run.parent.name / run.name / ended.path.name
         stated = json.loads((expected / "epochs.jsonl").read_bytes().splitlines()[0])
-        lines = b"".join(json_line(_without_later(row, stated)) for row in ended.epochs())
+        lines = b"".join(json_line(_without_later(row.content, stated)) for row in ended.epochs())
         if same_bits:
             assert lines == (expected / "epochs.jsonl").read_bytes()
             trained = (ended.path / "final.safetensors").read_bytes()

@@ -111,7 +111,7 @@ def with_scores(store: EntryStore, seed: int, values: list[float]) -> None:
     folder = store.seed(seed)
     rows = folder.epochs()
     folder.table.unlink()
-    changed = [{**row, "scores": [value] * 5} for row, value in zip(rows, values, strict=True)]
+    changed = [{**row.content, "scores": [value] * 5} for row, value in zip(rows, values, strict=True)]
     folder.lines.write_bytes(b"".join(map(json_line, changed)))
 
 
@@ -207,5 +207,5 @@ def test_markdown_shows_labels_as_they_are() -> None:
 def test_a_damaged_seed_is_not_said_to_go_on(store: EntryStore) -> None:
     store.seed(1).path.joinpath("run.json").write_text("{")
     assert not [group for group in groups(store) if group.state == "stopped"]
-    store.seed(0).write_record({**(store.seed(0).record() or {}), "status": "running"})
+    store.seed(0).write_record(store.seed(0).record().changed(status="running"))
     assert [group.seeds for group in groups(store) if group.state == "stopped"] == [(0,)]

@@ -18,7 +18,7 @@ from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results import probes
-from qrlsuite.results.records import EntryRecord
+from qrlsuite.results.records import EntryRecord, ProbeRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER
@@ -698,7 +698,7 @@ def test_whoever_is_to_check_dependent_seeds_is_told_what_and_by_which_plugin(
 ) -> None:
     own.load(write("a b/mistakes.py", MISTAKES))
     store = EntryStore.create(Path("runs"), resolve("beam6g", entry))
-    said = str(probes.refusal(store, {"seed": 6}))
+    said = str(probes.refusal(store, ProbeRecord(result="differs", seed=6)))
     assert (
         f"`qrlsuite check {expected} --plugin '{Path('a b/mistakes.py').absolute()}'` looks for them" in said
     )

@@ -10,6 +10,7 @@ import pytest
 import qrlsuite
 from qrlsuite.results import provenance
 from qrlsuite.results.provenance import commit_of
+from qrlsuite.results.records import Provenance
 
 
 def git(folder: Path, *words: str) -> str:
@@ -73,12 +74,12 @@ def test_the_suite_s_own_working_copy_is_recorded() -> None:
         pytest.skip("not a working copy")
     head = git(package.parent, "rev-parse", "HEAD")
     provenance._commit.cache_clear()  # an earlier test of this process may have hidden git
-    recorded = provenance.collect([])["commit"]
+    recorded = provenance.collect([]).commit
     assert recorded is not None
     assert head.startswith(recorded.removesuffix("-dirty").rpartition("-g")[2])
 
 
 def test_every_version_is_told_once() -> None:
-    made = [{"versions": {"numpy": v}, "python": "3.11", "commit": None} for v in ("2.4", "2.3", "2.4")]
+    made = [Provenance(versions={"numpy": v}, python="3.11", commit=None) for v in ("2.4", "2.3", "2.4")]
     assert provenance.versions(made) == {"numpy": ("2.3", "2.4"), "python": ("3.11",)}
-    assert provenance.texts(made, "commit") == ()
+    assert provenance.distinct(origin.commit for origin in made) == ()

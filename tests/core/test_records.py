@@ -15,7 +15,8 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard.shelf import PLANS
 from qrlsuite.leaderboard.shelf.published import OF_STUDIES, PUBLISHED, encode_record
-from qrlsuite.results.records import EntryRecord
+from qrlsuite.results.records import EntryRecord, EpochLine, Provenance, Record, RunRecord, TimingLine
+from qrlsuite.results.store import json_line
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 ENTRIES = sorted(
@@ -32,6 +33,21 @@ def test_every_stored_entry_is_written_again_to_its_bytes() -> None:
         samplers.add(record.tuning and record.tuning.sampler)
     assert len(ENTRIES) > 390
     assert {"halving", "bayesian", None} <= samplers, "records of older searches are among them"
+
+
+def test_every_stored_run_is_written_again_to_its_bytes() -> None:
+    runs = sorted(GOLDEN.glob("**/run.json"))
+    for path in runs:
+        record = RunRecord.read(json.loads(path.read_bytes()), path)
+        assert encode_record(record.content) == path.read_bytes(), path
+        assert encode_record(record.changed(status=record.status).content) == path.read_bytes(), path
+    assert len(runs) > 20
+    lines = [
+        (path, line) for path in GOLDEN.glob("**/epochs.jsonl") for line in path.read_bytes().splitlines(True)
+    ]
+    for path, line in lines:
+        assert json_line(EpochLine.read(json.loads(line), path).content) == line
+    assert len(lines) > 100
 
 
 def whole() -> tuple[Path, dict[str, Any]]:
@@ -56,9 +72,33 @@ def whole() -> tuple[Path, dict[str, Any]]:
     return path, content
 
 
+ENTRY, ENTRY_CONTENT = whole()
+RUN = GOLDEN / "run.json"
+RUN_CONTENT = {
+    "plan": "0" * 16, "task": "tiny", "task_hash": "1", "entry": "ddqn-mlp-2", "label": "ddqn mlp",
+    "algorithm": "ddqn", "algorithm_options": {}, "model": "mlp", "family": "classical", "model_options": {},
+    "parameters": {"classical": 3, "quantum": 0, "networks": 1}, "seed": 3, "interactions_per_epoch": 60,
+    "code": ENTRY_CONTENT["code"], "probe": {"result": "differs", "difference": "scores"}, "status": "finished",
+    "epochs": 2, "diverged": 1, "imported": {}, "agent": False,
+    "provenance": [ENTRY_CONTENT["published"]["provenance"][0] | {"host": "node", "before": [{"python": "3.11"}]}],
+}  # fmt: skip
+LINES = GOLDEN / "epochs.jsonl"
+LINE_CONTENT = {
+    "epoch": 1, "scores": [0.5, 1.0], "score": 0.75, "loss": 0.5, "train_return": 0.5, "measured.violations": 1.0,
+    "measured": {"length": 2.0}, "executions": {"forward": 3, "shots": 100}, "diverged": True,
+}  # fmt: skip
+TIME_CONTENT = {
+    "epoch": 1,
+    "train": 0.5,
+    "validate": 0.25,
+    "cpu": 0.7,
+    "group": 3,
+    "host": "node",
+    "time": "now",
+}
 FREE = {
     "format_version", "identity.task", "identity.algorithm_options", "identity.model_options", "task_file",
-    "tuning.space", "published.provenance.0", "published.agents.provenance.0",
+    "tuning.space", "provenance.0.device.numba-cuda",
 }  # fmt: skip
 """What is read by others, or has keys that nobody here knows."""
 
@@ -72,20 +112,42 @@ def keys(value: Any, *path: str) -> Iterator[tuple[str, ...]]:
             yield from keys(inner, *own)
 
 
-ENTRY = whole()
+@pytest.mark.parametrize(
+    ("kind", "path", "content"), [(EntryRecord, ENTRY, ENTRY_CONTENT), (RunRecord, RUN, RUN_CONTENT)]
+)
+def test_a_whole_record_is_read_and_keys_of_later_versions_stay(
+    kind: type[Record], path: Path, content: dict[str, Any]
+) -> None:
+    assert kind.read(content, path).content == content
+    later = {**content, "later": [1], "code": {**content["code"], "later": 1}}
+    assert kind.read(later, path).changed(plan="2").content == {**later, "plan": "2"}
 
 
-def test_a_whole_record_is_read() -> None:
-    path, content = ENTRY
-    assert EntryRecord.read(content, path).content == content
-    later = {**content, "later": [1], "published": {**content["published"], "later": {"a": 1}}}
-    record = EntryRecord.read(later, path).changed(preset=None)
-    assert record.content == {**later, "preset": None}, "keys of later versions stay"
+def test_what_older_records_lack_has_a_meaning() -> None:
+    run = RunRecord(task="tiny", task_hash="1", entry="ddqn-mlp-2", seed=3, status="finished", epochs=2)
+    assert (run.code_identity, run.probe, run.provenance, run.parameters) == (None, None, [], {})
+    assert run.agent
+    assert Provenance().device.kind == "cpu"
+    with pytest.raises(
+        StoreError, match="is not a run's record: missing key 'seed'; restore the file or delete"
+    ):
+        RunRecord.read({name: value for name, value in RUN_CONTENT.items() if name != "seed"}, RUN)
 
 
-@pytest.mark.parametrize("key", list(keys(ENTRY[1])), ids=".".join)
-def test_a_damaged_key_is_named(key: tuple[str, ...]) -> None:
-    path, content = ENTRY
+CASES = [
+    *((EntryRecord, ENTRY, ENTRY_CONTENT, key) for key in keys(ENTRY_CONTENT)),
+    *((RunRecord, RUN, RUN_CONTENT, key) for key in keys(RUN_CONTENT)),
+    *((EpochLine, LINES, LINE_CONTENT, key) for key in keys(LINE_CONTENT)),
+    *((TimingLine, LINES, TIME_CONTENT, key) for key in keys(TIME_CONTENT)),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "content", "key"), CASES, ids=[".".join(case[-1]) for case in CASES]
+)
+def test_a_damaged_key_is_named(
+    kind: type[Record], path: Path, content: dict[str, Any], key: tuple[str, ...]
+) -> None:
     content = copy.deepcopy(content)
     table: Any = content
     for name in key[:-1]:
@@ -93,6 +155,6 @@ def test_a_damaged_key_is_named(key: tuple[str, ...]) -> None:
     last: Any = int(key[-1]) if isinstance(table, list) else key[-1]
     table[last] = [[]] if isinstance(table[last], str | None) else "x"
     with pytest.raises(StoreError) as error:
-        EntryRecord.read(content, path)
-    assert str(error.value).startswith(f"{path} is not an entry's record: ")
+        kind.read(content, path)
+    assert str(error.value).startswith(f"{path} is not {kind.what}: ")
     assert ".".join(key) in str(error.value)

@@ -16,7 +16,7 @@ def test_shots_do_not_depend_on_when_others_end_their_episodes(tiny_task: str, t
     Path(tiny_task).write_text(short)
     circuit = {"epochs": 2, "model": "vqc-pennylane", "settings": ("qubits=2", "layers=1", "shots=20")}
     together = train("together", range(3), **circuit)
-    longest = [max(EntryStore(together).seed(seed).epochs()[0]["scores"]) for seed in range(3)]
+    longest = [max(EntryStore(together).seed(seed).epochs()[0].scores) for seed in range(3)]
     assert min(longest) < max(longest), "or nobody waits, and the test proves nothing"
     waits = longest.index(min(longest))
     assert results(together, waits) == results(train("alone", [waits], **circuit), waits)
@@ -28,7 +28,7 @@ def test_native_and_pennylane_agents_of_one_seed_act_alike(train: Train) -> None
     rows = []
     for model in ("vqc-native", "vqc-pennylane"):
         entry = train("runs", [0], 1, model=model, settings=settings)
-        rows.append(EntryStore(entry).seed(0).epochs()[0])
+        rows.append(EntryStore(entry).seed(0).epochs()[0].content)
     for name in ("train_return", "train_score", "scores", "executions"):
         assert rows[0][name] == rows[1][name], name
     assert rows[0]["loss"] == pytest.approx(rows[1]["loss"], rel=1e-9)

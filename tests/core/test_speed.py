@@ -15,7 +15,6 @@ from qrlsuite.errors import FileError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.results import provenance, speed
-from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.speed import Estimate, Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import StudySpec
@@ -123,19 +122,18 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
     found = [file for folder in published.folders() for file in folder.glob("*/*/entry.json")]
     checked = 0
     for file in found:
-        record = json.loads(file.read_text())
-        if {provenance.device_kind(made) for made in record["published"]["provenance"]} != {"cpu"}:
+        record = EntryStore(file.parent).record()
+        hours = record.published
+        assert hours is not None
+        if {origin.device.kind for origin in hours.provenance} != {"cpu"}:
             continue  # hours of a GPU are no core-hours
-        entry = EntryRecord.read(record, file).entry(str(file))
-        hours = record["published"]
-        if any(
-            made.get("numerics", {}).get("model", 1) != entry.model.numerics for made in hours["provenance"]
-        ):
+        entry = record.entry(str(file))
+        if any(origin.numerics.get("model", 1) != entry.model.numerics for origin in hours.provenance):
             continue  # trained by other code
         checked += 1
-        seconds = hours["core_hours"] * 3600 / hours["seeds"] / hours["epochs"]
-        low, high = known.estimate(entry, min(hours["seeds"], 50)).range(1) or (0.0, 0.0)
-        assert low <= seconds <= high, (record["label"], seconds, low, high)
+        seconds = hours.core_hours * 3600 / hours.seeds / hours.epochs
+        low, high = known.estimate(entry, min(hours.seeds, 50)).range(1) or (0.0, 0.0)
+        assert low <= seconds <= high, (record.label, seconds, low, high)
     assert checked >= 37
 
 

@@ -63,7 +63,7 @@ def train(entry: Callable[..., Entry], tmp_path: Path) -> Train:
 def results(folder: Path, seed: int) -> tuple[list[dict[str, Any]], bytes]:
     """What must depend on the seed alone: lines, circuit executions among them, and the agent."""
     store = EntryStore(folder).seed(seed)
-    return store.epochs(), (store.path / "final.safetensors").read_bytes()
+    return [line.content for line in store.epochs()], (store.path / "final.safetensors").read_bytes()
 
 
 def recorded(group: Trainer) -> list[NDArray[np.float32]]:

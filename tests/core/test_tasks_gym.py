@@ -232,7 +232,7 @@ def train(entry: Entry, folder: Path, seeds: list[int], epochs: int = 4) -> Entr
 
 
 def test_scores_are_the_environments_or_returns(stranger: Callable[..., Entry], tmp_path: Path) -> None:
-    scores = train(stranger(source="info"), tmp_path / "info", [0]).seed(0).epochs()[-1]["scores"]
+    scores = train(stranger(source="info"), tmp_path / "info", [0]).seed(0).epochs()[-1].scores
     steps = np.array(scores) * 12
     np.testing.assert_allclose(steps, steps.round(), atol=1e-5)
     assert (steps >= 3).all()
@@ -252,7 +252,7 @@ def test_an_environment_that_raises_fails_its_group_and_keeps_finished_epochs(
         match=r"environment 'gym' failed: ZeroDivisionError: the cart left the rails .*strangers.py, line .*; finished",
     ):
         group.GroupRun([(entry, store, [0])], 4).run()
-    assert [row["epoch"] for row in store.seed(0).epochs()] == [1, 2]
+    assert [row.epoch for row in store.seed(0).epochs()] == [1, 2]
     group.GroupRun([(entry, store, [0])], 4).run()
     undisturbed = train(entry, tmp_path / "undisturbed", [0])
     assert results(store.path, 0) == results(undisturbed.path, 0)

@@ -143,8 +143,8 @@ def test_the_preset_names_the_gpu_that_trained_its_trials(tiny_task: str, tmp_pa
     first = EntryStore.create(here.runs, here.trials[0].entry).seed(here.trials[0].seeds[0])
     record = first.record()
     assert record is not None
-    record["provenance"][0]["device"] = {"kind": "cuda", "name": "NVIDIA H200"}
-    first.write_record(record)
+    origin = record.provenance[0].changed(device={"kind": "cuda", "name": "NVIDIA H200"})
+    first.write_record(record.changed(provenance=[origin]))
     again = search.Search(request(tiny_task), tmp_path)
     assert finish(again).trained == 0
     tuning = again.preset().tuning

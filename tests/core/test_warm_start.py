@@ -165,7 +165,7 @@ def test_workers_without_a_shared_folder_and_the_probe_begin_alike(root: Path) -
         own = warm.seed(seed).parameters()
         assert all(np.array_equal(arrays[f"{POLICY}{name}"][seed], value) for name, value in own.items())
     side = probe.train(entry, [1], 2, start=warm.start_of(1))
-    scores = warm.seed(1).epochs()[0]["scores"]
+    scores = warm.seed(1).epochs()[0].scores
     assert side.lines[0]["scores"] == scores
     together = probe.train(entry, [0, 1, 2], 2, start=warm.start_of(1))
     assert together.lines[0]["scores"] == scores

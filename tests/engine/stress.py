@@ -93,4 +93,4 @@ def compare(straight: Path, entry: Path, seeds: int, epochs: int) -> None:
     """Raise AssertionError unless all bytes are equal and every epoch is there once."""
     for seed in range(seeds):
         assert results(straight, seed) == results(entry, seed), f"seed {seed} differs"
-        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, epochs + 1))
+        assert [row.epoch for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, epochs + 1))

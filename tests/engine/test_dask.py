@@ -238,9 +238,9 @@ def test_workers_of_another_version_or_without_the_suite_are_left_out_by_name(
         for seed in range(SEEDS):
             assert results(entry, seed) == results(straight, seed)
             assert bare.poll() is None, "nothing was sent to it that it cannot read"
-            (origin,) = (EntryStore(entry).seed(seed).record() or {})["provenance"]
-            assert origin["host"] == os.uname().nodename
-            assert origin["versions"]["qrlsuite"] == __version__
+            (origin,) = EntryStore(entry).seed(seed).record().provenance
+            assert origin.host == os.uname().nodename
+            assert origin.versions["qrlsuite"] == __version__
     finally:
         bare.kill()
         bare.wait()

@@ -20,6 +20,7 @@ from qrlsuite.options import build as build_options
 from qrlsuite.plugins.engines.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import _process_start, acquire
+from qrlsuite.results.records import RunRecord
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
 from tests.commands import answer, qrlsuite, say, start, start_worker
@@ -135,7 +136,7 @@ def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(tr
     entry = train("runs", [0, 1], 2)
     train("runs", [2], 1)
     store = EntryStore(entry)
-    store.seed(2).write_record({**(store.seed(2).record() or {}), "status": "running", "epochs": 1})
+    store.seed(2).write_record(store.seed(2).record().changed(status="running", epochs=1))
     runs = ("--runs", str(entry.parent.parent))
 
     def collect(*words: str) -> str:
@@ -163,7 +164,7 @@ def test_status_reads_our_own_files_only(train: Train, monkeypatch: pytest.Monke
     entry = train("runs", [0, 1], 1)
     store = EntryStore(entry)
     write_json(entry / "slurm" / "submitted.json", {"tasks": [{"job": "9_3", "seeds": [5, 6], "epochs": 3}]})
-    store.seed(1).write_record({"seed": 1, **store.names, "status": "running", "epochs": 1})
+    store.seed(1).write_record(RunRecord(seed=1, **store.names, status="running", epochs=1))
     claim = acquire(store, [0])
     monkeypatch.setattr(subprocess, "run", lambda *arguments, **options: pytest.fail("it asked a queue"))
     found = {group.state: group for group in survey.groups(store)}
@@ -177,7 +178,7 @@ def test_status_reads_our_own_files_only(train: Train, monkeypatch: pytest.Monke
 def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(kept: Train) -> None:
     store = EntryStore(kept("runs", [0, 1], 1))
     for seed in (0, 1):
-        store.seed(seed).write_record({"seed": seed, **store.names, "status": "running", "epochs": 1})
+        store.seed(seed).write_record(RunRecord(seed=seed, **store.names, status="running", epochs=1))
     write_json(store.path / "slurm" / "submitted.json", {"tasks": [{"job": "9", "seeds": [1], "epochs": 3}]})
     assert survey.look(store).seeds == {"interrupted": 1, "submitted": 1}
     assert survey.look(store, queued=[]).seeds == {"interrupted": 2}, "it has left the queue"

@@ -75,11 +75,7 @@ def entry(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "tiny.toml").write_text(TINY)
     kept = store.EntryStore(trainer(str(folder / "tiny.toml"), folder)("runs", [0, 1], 2))
     kept.seed(1).cut(1)
-    record = kept.seed(1).record() or {}
-    store.write_json(
-        kept.seed(1).path / "run.json",
-        {**{k: v for k, v in record.items() if k != "format_version"}, "status": "running", "epochs": 1},
-    )
+    kept.seed(1).write_record(kept.seed(1).record().changed(status="running", epochs=1))
     for path in kept.groups.glob("*"):
         path.rename(kept.groups / "g")
     claim = {"host": "elsewhere", "pid": 1, "started": "1", "token": "x", "seeds": [1]}

@@ -109,7 +109,7 @@ def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> N
         entry = finished(tmp_path / "runs", 2, 6)
     assert entry is not None
     for seed in (0, 1):
-        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 7))
+        assert [row.epoch for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 7))
 
 
 @pytest.fixture
@@ -234,15 +234,15 @@ def test_a_worker_whose_seeds_were_taken_over_writes_nothing_more(
         run.run()
     assert len(entry.seed(0).epochs()) == 2
     assert [header.epoch for header in checkpoint.headers(entry)] == [saved]
-    assert (entry.seed(0).record() or {})["status"] == "running"
+    assert not entry.seed(0).finished()
 
 
 def test_lines_of_two_workers_are_put_in_order_when_the_run_goes_on(train: Train) -> None:
     straight = train("straight", [0], 4)
     entry = EntryStore(train("runs", [0], 2))
     folder = entry.seed(0)
-    folder.write_record({**(folder.record() or {}), "status": "running"})
-    further = [store.json_line(row) for row in EntryStore(straight).seed(0).epochs()[2:]]
+    folder.write_record(folder.record().changed(status="running"))
+    further = [store.json_line(row.content) for row in EntryStore(straight).seed(0).epochs()[2:]]
     folder.lines.write_bytes(further[0] + further[0] + further[1] + further[1])
     with pytest.raises(StoreError, match="epoch 4 is missing"):
         folder.epochs()

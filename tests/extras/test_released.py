@@ -329,9 +329,10 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
     expected = learning_curve(np.float32(content(1)["val_returns"][1:]))
     assert (found.curves[1] == expected).all()
     (store,) = entries(tmp_path / "runs")
-    record = store.seed(1).record() or {}
-    assert record["imported"]["file"] == "1.pkl"
-    assert record["imported"]["arguments"]["lr"] == 5e-4
+    record = store.seed(1).record()
+    assert record is not None
+    assert record.imported["file"] == "1.pkl"
+    assert record.imported["arguments"]["lr"] == 5e-4
     with pytest.raises(StoreError, match="holds curves that another program made"):
         store.entry()
     listed = say("runs", "--runs", str(tmp_path / "runs"))
@@ -402,7 +403,7 @@ def test_an_import_in_between_is_not_overwritten(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(imports, "acquire", late)
     done = import_files([first], task, "ddqn", "theirs", runs)
     assert done.new == (1,)
-    files = [(done.store.seed(seed).record() or {})["imported"]["file"] for seed in done.store.seeds()]
+    files = [done.store.seed(seed).record().imported["file"] for seed in done.store.seeds()]
     assert files == ["2.pkl", "1.pkl"]
 
 

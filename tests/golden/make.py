@@ -63,11 +63,11 @@ def machine() -> dict[str, Any]:
 
     made = provenance.collect([])
     return {
-        "system": made["system"],
-        "processor": made["processor"],
+        "system": made.system,
+        "processor": made.processor,
         "torch kernels": torch.backends.cpu.get_cpu_capability(),
         "numba target": cpu_target.target_context.codegen().magic_tuple()[1],
-        **{name: made["versions"][name] for name in ("torch", "numpy", "numba")},
+        **{name: made.versions[name] for name in ("torch", "numpy", "numba")},
     }
 
 
@@ -82,7 +82,7 @@ def hashes() -> dict[str, Any]:
     }
     published = []
     for path in sorted(PUBLISHED.glob("*/*/entry.json")):
-        record = EntryStore(path.parent).record()
+        record = EntryStore(path.parent).record().content
         published.append(
             {name: value for name, value in record.items() if name not in ("published", "tuning")}
         )
@@ -120,7 +120,9 @@ def write(folder: Path) -> None:
             for seed in SEEDS:
                 there = finished / entry.task.name / entry.name / f"seed-{seed:04d}"
                 there.mkdir(parents=True)
-                (there / "epochs.jsonl").write_bytes(b"".join(map(json_line, ended.seed(seed).epochs())))
+                (there / "epochs.jsonl").write_bytes(
+                    b"".join(json_line(line.content) for line in ended.seed(seed).epochs())
+                )
                 shutil.copy(ended.seed(seed).path / "final.safetensors", there)
             shutil.rmtree(ended.path)
     for path in [*interrupted.rglob("timings.jsonl"), *interrupted.rglob("progress.json")]:

@@ -26,7 +26,7 @@ from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.options import parse_setting
-from qrlsuite.results import provenance
+from qrlsuite.results.records import DeviceRecord, Provenance
 from qrlsuite.results.store import EntryStore
 from tests.leaderboard import boards
 
@@ -176,11 +176,10 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
 
 def test_devices_that_mix_within_an_entry_are_named() -> None:
     one, two = boards.graded(2)
-    cpu, cuda = ({"device": {"kind": kind}} for kind in ("cpu", "cuda"))
+    cpu, cuda = (Provenance(device=DeviceRecord(kind=kind)) for kind in ("cpu", "cuda"))
     made = boards.of([boards.changed(one, made_with=[cpu, cuda]), boards.changed(two, made_with=[cpu])])
     note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
     assert note in markdown(made).split("  \n")
-    assert provenance.devices([{}, {"device": {"kind": "cuda", "name": "H100"}}]) == ("cpu", "cuda")
     assert "several kinds of device" not in markdown(boards.of([one, two]))
 
 

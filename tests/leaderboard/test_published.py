@@ -114,11 +114,10 @@ def test_names_of_hosts_are_not_exported(runs: Path, tmp_path: Path) -> None:
     """A remote worker's record has one, in the run and in what it replaced."""
     store = EntryStore(runs)
     for seed in store.seeds():
-        record = store.seed(seed).record() or {}
-        del record["format_version"]
-        (made,) = record["provenance"]
-        both = [{**made, "python": "3.0", "host": "secret-node"}, {**made, "host": "secret-node"}]
-        store.seed(seed).write_record({**record, "provenance": both})
+        record = store.seed(seed).record()
+        (made,) = record.provenance
+        both = [made.changed(python="3.0", host="secret-node"), made.changed(host="secret-node")]
+        store.seed(seed).write_record(record.changed(provenance=both))
     text = (publish(runs, tmp_path / "entries") / "entry.json").read_text()
     assert '"before"' in text
     assert "secret-node" not in text
@@ -391,9 +390,9 @@ def test_what_a_seed_was_made_with_names_device_and_every_plugin(
         of_kind = known.entries[specs.kind(kind)]
         monkeypatch.setitem(of_kind, name, dataclasses.replace(of_kind[name], distribution=packages[kind]))
     folder = train("runs", [0], 1, model="vqc-native", settings=("qubits=2", "layers=1", "ansatz=cx"))
-    (made,) = (EntryStore(folder).seed(0).record() or {})["provenance"]
-    assert set(packages.values()) <= made["versions"].keys()
-    assert made["device"] == {"kind": "cpu", "name": provenance.processor()}
+    (made,) = EntryStore(folder).seed(0).record().provenance
+    assert set(packages.values()) <= made.versions.keys()
+    assert made.device.content == {"kind": "cpu", "name": provenance.processor()}
 
 
 def elsewhere(record: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ import pytest
 from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
+from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.studies.looks import StudyWithLooks, new
 from qrlsuite.studies.outcome import in_folder
@@ -38,8 +39,8 @@ def put(study: StudyWithLooks, looks: int) -> None:
                 write_atomically(folder.table, table_bytes(rows))
                 lines = (json_line({"epoch": epoch, "cpu": 1.8}) for epoch in range(1, 21))
                 write_atomically(folder.timings, b"".join(lines))
-                record = {"status": "finished", "epochs": 20, "parameters": {}, "provenance": []}
-                folder.write_record({"plan": study.hash, "seed": seed, **store.names, **record})
+                record = RunRecord(plan=study.hash, seed=seed, **store.names, status="finished", epochs=20)
+                folder.write_record(record)
         state = study.look()
 
 

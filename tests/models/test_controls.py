@@ -170,7 +170,7 @@ def test_fixed_parameters_stay_and_a_resumed_run_ends_alike(model: str, train: T
     assert not any(stored.endswith(name) for stored in moved)
     record = EntryStore(straight).seed(0).record()
     assert record is not None
-    assert record["parameters"]["fixed"] == size
+    assert record.parameters["fixed"] == size
 
 
 def agent_of(folder: Path, model: str) -> nn.Module:

@@ -155,7 +155,7 @@ def test_canceled_killed_and_timed_out_tasks_all_finish_once(tmp_path: Path, tra
     assert store.finished(range(SEEDS), epochs) == set(range(SEEDS))
     assert {seed: results(entry, seed) for seed in before} == before, "finished seeds were left alone"
     for seed in range(SEEDS):
-        assert [row["epoch"] for row in store.seed(seed).epochs()] == list(range(1, epochs + 1))
+        assert [row.epoch for row in store.seed(seed).epochs()] == list(range(1, epochs + 1))
 
     run(tmp_path, "--runs", "straight", "--workers", "2", epochs=epochs, seeds=3)
     straight = next((tmp_path / "straight" / "tiny").iterdir())

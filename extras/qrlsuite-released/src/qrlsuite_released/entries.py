@@ -22,6 +22,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import Task, digest
 from qrlsuite.results.claims import SeedsClaimedError, acquire
 from qrlsuite.results.provenance import collect
+from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, shortest, table_bytes, write_atomically, write_json
 from qrlsuite_released.unpickle import Released, read
 
@@ -92,7 +93,8 @@ def import_files(
         ) from None
     try:
         seeds = store.seeds()
-        digests = {str((store.seed(seed).record() or {}).get("imported", {}).get("sha256")) for seed in seeds}
+        records = [record for seed in seeds if (record := store.seed(seed).record()) is not None]
+        digests = {record.imported.get("sha256") for record in records}
         new: list[int] = []
         for path, content, scores, parameters in contents:
             if content.sha256 not in digests:
@@ -180,23 +182,29 @@ def _write(
     folder = store.seed(seed)
     write_atomically(folder.table, table_bytes(rows))
     folder.write_record(
-        {
-            "task": entry.task_name,
-            "task_hash": entry.task_hash,
-            "entry": entry.name,
-            "label": entry.label,
-            "algorithm": entry.identity.algorithm,
-            "algorithm_options": {},
-            "model": MODEL,
-            "family": "quantum" if parameters["quantum"] else "classical",
-            "model_options": entry.identity.model_options,
-            "parameters": parameters,
-            "seed": seed,
-            "status": "finished",
-            "epochs": len(rows),
-            "imported": {"file": path.name, "sha256": content.sha256, "arguments": dict(content.arguments)},
-            "provenance": [{"imported_with": collect([])["versions"]}],
-        }
+        RunRecord.model_validate(
+            {
+                "task": entry.task_name,
+                "task_hash": entry.task_hash,
+                "entry": entry.name,
+                "label": entry.label,
+                "algorithm": entry.identity.algorithm,
+                "algorithm_options": {},
+                "model": MODEL,
+                "family": "quantum" if parameters["quantum"] else "classical",
+                "model_options": entry.identity.model_options,
+                "parameters": parameters,
+                "seed": seed,
+                "status": "finished",
+                "epochs": len(rows),
+                "imported": {
+                    "file": path.name,
+                    "sha256": content.sha256,
+                    "arguments": dict(content.arguments),
+                },
+                "provenance": [{"imported_with": collect([]).versions}],
+            }
+        )
     )
 
 
