@@ -11,6 +11,7 @@ is interpolated, nothing is carried backward, and no curve goes on beyond its la
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import re
 from collections import defaultdict
@@ -29,7 +30,7 @@ from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.entry import EXTERNAL
 from qrlsuite.experiment.task import TaskFile, digest
 from qrlsuite.leaderboard.shelf.curves import require_scores
-from qrlsuite.leaderboard.shelf.import_seeds import Imported, differences, differs, unplaced
+from qrlsuite.leaderboard.shelf.import_seeds import Imported, unite
 from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance
 from qrlsuite.results.claims import acquire
@@ -39,6 +40,7 @@ from qrlsuite.results.records import EntryRecord, RunRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import (
     EntryStore,
+    SeedStore,
     entries,
     round_means,
     table_bytes,
@@ -419,30 +421,24 @@ def _write(
         store.write_record(record)
     claim = acquire(store, list(curves))
     try:
-        present, new, known, differing = set(store.seeds()), list[int](), list[int](), list[int]()
-        for seed, curve in curves.items():
-            if seed in present:
-                known.append(seed)
-                if differs(store, seed, curve) or len(store.seed(seed).epochs()) != len(curve):
-                    differing.append(seed)
-                continue
-            _write_seed(store, seed, curve, record, points[entry, seed])
-            new.append(seed)
+        new, known, _, notes = unite(
+            store,
+            printable(points[entry, min(curves)].source),
+            {
+                seed: (curve, functools.partial(_write_seed, curve, record, points[entry, seed]))
+                for seed, curve in curves.items()
+            },
+        )
     finally:
         claim.release()
     lasts = [int(points[entry, seed].steps[-1]) for seed in curves]
-    notes = differences(differing) + _notes(
-        entry, curves, lasts, sorted({*present, *new}), record.task_file.protocol.interactions
-    )
+    notes += _notes(entry, curves, lasts, store.seeds(), record.task_file.protocol.interactions)
     return Imported(
         store, record.name, record.label, record.task_name, tuple(new), tuple(known), tuple(notes)
     )
 
 
-def _write_seed(
-    store: EntryStore, seed: int, curve: NDArray[np.float64], record: EntryRecord, own: Points
-) -> None:
-    made = unplaced(store, seed)
+def _write_seed(curve: NDArray[np.float64], record: EntryRecord, own: Points, made: SeedStore) -> None:
     made.path.mkdir(parents=True)
     rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(curve, start=1)]
     write_atomically(made.table, table_bytes(rows))
@@ -456,7 +452,7 @@ def _write_seed(
                 "algorithm": EXTERNAL,
                 "model": record.identity.model,
                 "parameters": {},
-                "seed": seed,
+                "seed": made.seed,
                 "interactions_per_epoch": record.task_file.protocol.interactions,
                 "status": "finished",
                 "epochs": len(rows),
@@ -470,7 +466,6 @@ def _write_seed(
             }
         )
     )
-    made.path.rename(store.seed(seed).path)
 
 
 def _notation_of(entry: str) -> tuple[str, dict[str, Any]]:

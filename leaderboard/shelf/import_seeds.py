@@ -7,10 +7,11 @@ one. Existing seeds stay unchanged.
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,21 +119,29 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
     seeds = [seed for seed in held if seed < TUNING_SEEDS]
     if not seeds:
         raise StoreError(f"{source.path} holds no seed")
-    runs_by_seed = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
+    runs_by_seed = {seed: source.seed(seed).read() for seed in seeds} if exported is None else {}
     for run in runs_by_seed.values():  # all of them, before anything is written
         require_scores(run.curve, entry.task.file, source.seed(run.seed).path)
     agents = {} if exported is None else exported.parameters()
     store = EntryStore.create(runs, entry, _place_for(store, source, exported is not None, runs, entry))
     claim = acquire(store, seeds)
     try:
-        done = (
-            _from_runs(source, runs_by_seed, entry, store)
-            if exported is None
-            else _from_export(exported, agents, entry, store)
-        )
+        offered = _of_runs(source, runs_by_seed) if exported is None else _of_export(exported, agents, entry)
+        new, known, differing, notes = unite(store, source.path, offered)
+        if exported is None:
+            _take_checkpoints(source, store, sorted({*new, *known} - {*differing}))
+            records = (run.record for seed, run in runs_by_seed.items() if seed in new)
+            notes += _other_versions([made for r in records if r is not None for made in r.provenance], entry)
+        else:
+            notes += _other_versions(exported.provenance, entry)
+            if new:
+                notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
+            if without := sorted(set(new) - set(agents)):
+                notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
         if (plugins := identity.plugins(entry)) and not codes.others(store, code := identity.of(entry)):
             codes.prepare(store, code, plugins)
-        return done
+        label = f"{entry.label} {store.mark}".rstrip()
+        return Imported(store, entry.name, label, entry.task.name, tuple(new), tuple(known), tuple(notes))
     finally:
         claim.release()
 
@@ -163,40 +172,100 @@ def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
         )
 
 
-def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, store: EntryStore) -> Imported:
-    """Copy seeds with their agents and checkpoints."""
-    training = {seed for claim in living(source) for seed in claim.seeds}
-    newest, present = checkpoint.latest(source), set(store.seeds())
+Writer = Callable[[SeedStore], None]
+"""Writes a seed into an empty folder."""
+
+
+def unite(
+    store: EntryStore, source: Path | str, offered: Mapping[int, tuple[NDArray[np.float64], Writer | None]]
+) -> tuple[list[int], list[int], list[int], list[str]]:
+    """Put seeds into an entry's folder that it lacks, or that are longer than there.
+
+    Parameters
+    ----------
+    source:
+        Where the seeds come from.
+    offered:
+        By seed its curve (T,), and how it is written; None for a seed that cannot be taken over yet.
+
+    Returns
+    -------
+    tuple
+        The seeds that were put there; the seeds that were there already and stay, and those among them with another
+        curve there; and notes.
+    """
     new, known, differing, waiting = list[int](), list[int](), list[int](), list[int]()
-    origins: list[Provenance] = []
-    for seed, run in runs.items():
-        if seed in present:
-            known.append(seed)
-            if differs(store, seed, run.curve):
-                differing.append(seed)
-        elif seed in training or not (run.finished or seed in newest):
-            waiting.append(seed)
-        else:
-            _place(store, seed, source.seed(seed).path)
+    present = set(store.seeds())
+    for seed, (curve, write) in offered.items():
+        own = store.seed(seed).read().curve if seed in present else curve[:0]
+        shared = min(len(own), len(curve))
+        if not np.array_equal(own[:shared], curve[:shared]):
+            differing.append(seed)
+        elif write is not None and (seed not in present or len(own) < len(curve)):
+            _place(store, seed, write)
             new.append(seed)
-            origins += [] if run.record is None else run.record.provenance
-    _take_checkpoints(source, store, sorted({*new, *known} - {*differing}))
-    notes = differences(differing) + _other_versions(origins, entry)
+            continue
+        elif seed not in present:
+            waiting.append(seed)
+            continue
+        known.append(seed)
+    notes = []
+    if differing:
+        notes.append(
+            f"seeds {format_seeds(differing)} have other curves in {source} than in {store.path}: these stay, until "
+            "`qrlsuite runs rm` removes the entry"
+        )
     if waiting:
         notes.append(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
         )
-    return Imported(
-        store, entry.name, _label_of(entry, store), entry.task.name, tuple(new), tuple(known), tuple(notes)
-    )
+    return new, known, differing, notes
+
+
+def _place(store: EntryStore, seed: int, write: Writer) -> None:
+    """Put a seed into its place, whole or not at all; what is there stays until the new one is whole."""
+    place = store.seed(seed).path
+    made, old = (place.with_name(f".{place.name}.{word}") for word in ("import", "old"))
+    try:
+        for path in (made, old):
+            shutil.rmtree(path, ignore_errors=True)
+        write(SeedStore(made, seed))
+        if place.exists():
+            place.rename(old)
+        made.rename(place)
+        shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        shutil.rmtree(made, ignore_errors=True)
+        raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
+
+
+def _of_runs(
+    source: EntryStore, runs: Mapping[int, SeedRun]
+) -> dict[int, tuple[NDArray[np.float64], Writer | None]]:
+    """Return seeds of a results folder, whose folders are copied, with agents and checkpoints."""
+    training = {seed for claim in living(source) for seed in claim.seeds}
+    newest = checkpoint.latest(source)
+    ready = {seed for seed, run in runs.items() if run.finished or seed in newest} - training
+    return {
+        seed: (run.curve, functools.partial(_copy, source.seed(seed).path) if seed in ready else None)
+        for seed, run in runs.items()
+    }
+
+
+def _copy(folder: Path, made: SeedStore) -> None:
+    shutil.copytree(folder, made.path, ignore=shutil.ignore_patterns(".*"))
+    for path in made.path.iterdir():
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
 
 
 def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int]) -> None:
-    """Copy the checkpoints of seeds that are here and have none, so that they can go on."""
+    """Copy checkpoints of seeds that are here without one or with an earlier one, so that they can go on."""
     theirs, own = checkpoint.latest(source), checkpoint.latest(store)
     by_epoch: dict[int, list[int]] = {}
     for seed in seeds:
-        if seed in theirs and seed not in own and len(store.seed(seed).epochs()) >= theirs[seed].epoch:
+        later = seed in theirs and (seed not in own or own[seed].epoch < theirs[seed].epoch)
+        if later and len(store.seed(seed).epochs()) >= theirs[seed].epoch:
             by_epoch.setdefault(theirs[seed].epoch, []).append(seed)
     for members in by_epoch.values():
         for first in range(0, len(members), LARGEST_GROUP):
@@ -205,18 +274,13 @@ def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int
             checkpoint.save(store, group, epoch, arrays)
 
 
-def _from_export(
-    exported: PublishedEntry, agents: Mapping[int, Arrays], entry: Entry, store: EntryStore
-) -> Imported:
-    """Write seeds from their curves and agents; checkpoints are not exported, nor all agents."""
-    present, new, known, differing = set(store.seeds()), list[int](), list[int](), list[int]()
-    for row, seed in enumerate(exported.seeds):
-        curve = exported.curves[row]
-        if seed in present:
-            known.append(seed)
-            if differs(store, seed, curve):
-                differing.append(seed)
-            continue
+def _of_export(
+    exported: PublishedEntry, agents: Mapping[int, Arrays], entry: Entry
+) -> dict[int, tuple[NDArray[np.float64], Writer | None]]:
+    """Return the seeds of an export, which are written anew; it holds no checkpoints, nor all agents."""
+
+    def write(row: int, made: SeedStore) -> None:
+        seed, curve = exported.seeds[row], exported.curves[row]
         rows: list[dict[str, Any]] = [{"epoch": t, "score": float(v)} for t, v in enumerate(curve, start=1)]
         for name, values in exported.metrics(row).items():
             for line, value in zip(rows, values.tolist()):
@@ -226,7 +290,6 @@ def _from_export(
         diverged, probe = exported.published.diverged.get(str(seed)), exported.published.probe
         if diverged is not None:
             rows[diverged - 1]["diverged"] = True
-        made = unplaced(store, seed)
         made.path.mkdir(parents=True)
         write_atomically(made.table, table_bytes(rows))
         write_atomically(
@@ -258,59 +321,10 @@ def _from_export(
         )
         if seed in agents:
             write_atomically(made.agent, encode(agents[seed]))
-        made.path.rename(store.seed(seed).path)
-        new.append(seed)
-    notes = differences(differing) + _other_versions(exported.provenance, entry)
-    if new:
-        notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
-    if without := sorted(set(new) - set(agents)):
-        notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
-    return Imported(
-        store, entry.name, _label_of(entry, store), entry.task.name, tuple(new), tuple(known), tuple(notes)
-    )
 
-
-def unplaced(store: EntryStore, seed: int) -> SeedStore:
-    """Return an empty folder beside a seed's folder; remains of a killed import are removed."""
-    path = store.path / f".seed-{seed:04d}.import"
-    shutil.rmtree(path, ignore_errors=True)
-    return SeedStore(path, seed)
-
-
-def _place(store: EntryStore, seed: int, folder: Path) -> None:
-    """Copy a seed's folder, whole or not at all."""
-    copy = unplaced(store, seed).path
-    try:
-        shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(".*"))
-        for path in copy.iterdir():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-        copy.rename(store.seed(seed).path)
-    except OSError as error:
-        shutil.rmtree(copy, ignore_errors=True)
-        raise StoreError(f"cannot copy {folder} to {store.path}: {error.strerror or error}") from None
-
-
-def _label_of(entry: Entry, store: EntryStore) -> str:
-    """Return an entry's label, with the mark of seeds of other code."""
-    return f"{entry.label} {store.mark}".rstrip()
-
-
-def differs(store: EntryStore, seed: int, curve: NDArray[np.float64]) -> bool:
-    """Return whether a seed's curve here and a curve (T,) from elsewhere differ in the epochs that both have."""
-    own = store.seed(seed).read().curve
-    shared = min(len(own), len(curve))
-    return not np.array_equal(own[:shared], curve[:shared])
-
-
-def differences(seeds: Sequence[int]) -> list[str]:
-    """Name the seeds whose curves here differ from the imported ones."""
-    if not seeds:
-        return []
-    return [
-        f"seeds {format_seeds(seeds)} have other curves there than here: those here stay, until `qrlsuite runs rm` "
-        "removes the entry"
-    ]
+    return {
+        seed: (exported.curves[row], functools.partial(write, row)) for row, seed in enumerate(exported.seeds)
+    }
 
 
 def _other_versions(origins: Sequence[Provenance], entry: Entry) -> list[str]:

@@ -170,10 +170,10 @@ def test_more_seeds_are_added_and_those_here_stay(tmp_path: Path) -> None:
     take({"a": ([0], [[1, 2, 3]])}, maximum=10)
     more = take({"a": ([0, 1], [[1, 2, 4], [2, 3, 4]])})  # the task of the folder says all
     assert (more.new, more.known) == ((1,), (0,))
-    assert (
-        more.notes[0]
-        == "seeds 0:1 have other curves there than here: those here stay, until `qrlsuite runs rm` removes the entry"
-    )
+    assert "seeds 0:1 have other curves in " in more.notes[0]
+    assert f" than in {more.store.path}: these stay, until `qrlsuite runs rm` removes" in more.notes[0]
+    longer = api.import_curves({"a": ([0], [[1, 2, 3, 4]])}, steps=[10, 20, 30, 40], runs=tmp_path)[0]
+    assert (longer.new, api.load("a", runs=tmp_path).records[0].epochs) == ((0,), 4), "the longer curve wins"
     for options, message in (
         ({"maximum": 20}, "task 'external' has 10; give this one another --task NAME"),
         ({"thresholds": [5]}, "task 'external' has 6, 7, 8, 9; leave them out"),

@@ -45,8 +45,9 @@ def import_entries(
 ) -> None:
     """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only what is missing.
 
-    From a results folder, agents and checkpoints are copied too, from an export the agents that it has. Seeds that
-    are here already stay. Stop with Ctrl-C at any time; the same command continues.
+    From a results folder, agents and checkpoints are copied too, from an export the agents that it has. A seed
+    that is here already stays, unless it has more epochs there. Stop with Ctrl-C at any time; the same command
+    continues.
 
     Curves of other programs become external entries, which can be compared and drawn as any. At every grid point
     stands the last score at or before it. A path names a run: logs/small/seed-3/evaluations.npz is seed 3 of `small`.
