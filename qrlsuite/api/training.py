@@ -266,42 +266,15 @@ def tune(
     >>> small, circuit = tune("beam6g", ["mlp width=16", "vqc-native qubits=6"])  # doctest: +SKIP
     >>> entry = train("beam6g", f"mlp preset={small.written}")  # doctest: +SKIP
     """
-    where = where_of(engine, workers, device, fresh, same)
-    searches, display, path = plan_tuning(
-        task, several(entries), vary, sampler, seeds, epochs, objective, budget, out, where, runs, progress
-    )
-    tuning_runner.run(searches, Path(runs), where, display, path)
-    return searches
-
-
-def plan_tuning(
-    task: str,
-    entries: Sequence[str],
-    vary: str | Sequence[str] | Mapping[str, Any] | None,
-    sampler: str | None,
-    seeds: Seeds | None,
-    epochs: int | None,
-    objective: Literal["time", "cell", "area"],
-    budget: str | None,
-    out: str | PathLike[str] | None,
-    where: Where,
-    runs: str | PathLike[str],
-    progress: bool,
-) -> tuple[list[Search], TuneDisplay, Path | None]:
-    """Build the searches that `tune` and the command run, and show them; arguments as for `tune`.
-
-    Returns
-    -------
-    tuple
-        The searches, their display, and the preset file of a single search, None for a file of each below `runs`.
-    """
+    where, folder = where_of(engine, workers, device, fresh, same), Path(runs)
     check_positive("epochs", epochs)
-    requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective, budget)
+    requests = read_requests(task, several(entries), vary or (), sampler, seeds, epochs, objective, budget)
     path = preset_path(out, requests)
-    searches = tuning_runner.build(requests, Path(runs))
+    searches = tuning_runner.build(requests, folder)
     display = TuneDisplay(searches, where, not progress)
     display.begin()
-    return searches, display, path
+    tuning_runner.run(searches, folder, where, display, path)
+    return searches
 
 
 def evaluate(

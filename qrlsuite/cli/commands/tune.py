@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api.arguments import where_of
-from qrlsuite.api.training import plan_tuning
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
@@ -26,7 +25,8 @@ from qrlsuite.notation import write_setting
 from qrlsuite.results.survey import garbage
 from qrlsuite.results.text import counted, hours_text, size_text
 from qrlsuite.tuning import runner as tuning_runner
-from qrlsuite.tuning.search import FOLDER, Search
+from qrlsuite.tuning.display import TuneDisplay
+from qrlsuite.tuning.search import FOLDER, Search, preset_path, read_requests
 
 LARGE = 200
 """Trials from which a search without a budget has to be asked for twice."""
@@ -126,20 +126,11 @@ def tune(
     Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
     where = where_of(engine, workers, device, fresh, same)
-    searches, display, path = plan_tuning(
-        task,
-        entries,
-        vary,
-        sampler,
-        seeds,
-        epochs,
-        objective.value,
-        budget,
-        out,
-        where,
-        runs,
-        progress=not json_output,
-    )
+    requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective.value, budget)
+    path = preset_path(out, requests)
+    searches = tuning_runner.build(requests, runs)
+    display = TuneDisplay(searches, where, json_output)
+    display.begin()
     if not (dry_run or yes or budget):
         _require_few(searches)
     complete = not dry_run and tuning_runner.run(searches, runs, where, display, path)
