@@ -185,55 +185,6 @@ def trained(line: Path, tmp_path: Path) -> Author:
     return Author(Path(shutil.copytree(line, tmp_path / "line")))
 
 
-def test_an_edited_circuit_is_another_entry(author: Author) -> None:
-    assert author.run().returncode == 0
-    (name,) = author.entries()
-    code = read_json(author.runs / "tiny" / name / "seed-0000" / "run.json")["code"]
-    assert [part["role"] for part in code["parts"]] == [
-        "environment",
-        "algorithm",
-        "model",
-        "ansatz",
-        "backend",
-    ]
-
-    author.edit("own_circuit", "A circuit.", "A circuit of my own.  # with a comment")
-    author.edit("own_circuit", "weights", "angles")
-    author.edit("own_circuit", '"angles"', '"weights"')  # only the variable has another name
-    assert author.run(seeds="3").returncode == 0
-
-    author.edit("own_circuit", '"RY"', '"RZ"')
-    refused = author.run(seeds="4")
-    assert refused.returncode == 2
-    assert "seeds 0:3 of 'ddqn vqc-native qubits=2" in refused.stderr
-    assert "the circuit of ansatz 'own' of own has changed" in refused.stderr
-    assert "--fresh" in refused.stderr
-    assert "--same" in refused.stderr
-    assert EntryStore(author.runs / "tiny" / name).seeds() == [0, 1, 2]
-    repeated = author.run(
-        seeds="3"
-    )  # also where nothing would be trained: old numbers are not shown as new ones
-    assert repeated.returncode == 2
-
-    fresh = author.run("--fresh")
-    assert fresh.returncode == 0
-    aside = f"{name}@{code['digest'][:8]}"
-    assert f"now in {author.runs / 'tiny' / aside}" in "".join(fresh.stderr.split("\n"))
-    assert author.entries() == sorted([name, aside])
-    label = "ddqn vqc-native qubits=2 layers=1 ansatz=own"
-    assert author.board() == {label: 2, f"{label} @{code['digest'][:8]}": 3}
-    compared = author.command("compare", label, aside)
-    assert compared.returncode == 0, compared.stderr
-
-    author.edit("own_circuit", '"RZ"', '"RY"')  # back: its seeds are still there
-    assert author.run(seeds="3").returncode == 2
-    back = author.run("--fresh", seeds="3")
-    assert back.returncode == 0
-    assert "they are continued" in back.stderr
-    assert author.board()[label] == 3
-    assert author.board().keys() != {label}
-
-
 def test_its_author_may_say_that_nothing_changed(trained: Author) -> None:
     trained.edit("own_helper", "filled(layer, generator):", "filled(layer, generator, more=None):")
     refused = trained.run(model="line", seeds="4")

@@ -200,14 +200,6 @@ def test_a_second_name_of_a_layer_is_the_same_layer() -> None:
     )
 
 
-def test_a_stacked_population_is_bitwise_independent_of_company() -> None:
-    agents, x = modules(17), torch.randn(17, 64, 3)
-    whole = population.stack(agents)(x)
-    for size, offset in ((1, 0), (1, 16), (2, 3), (5, 7)):
-        part = population.stack(agents[offset : offset + size])(x[offset : offset + size])
-        assert torch.equal(part, whole[offset : offset + size])
-
-
 def test_modules_of_different_shape_are_refused() -> None:
     with pytest.raises(ValueError, match="same parameters with the same shapes"):
         population.stack([nn.Linear(2, 3), nn.Linear(3, 2)])

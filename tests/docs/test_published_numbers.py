@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -82,25 +84,47 @@ def test_the_two_halves_of_the_seeds() -> None:
     assert f"on seeds 50 to 99 the circuit is ahead in {second} cells" in text
 
 
+def about(title: str) -> str:
+    """Return a section of the page as one line."""
+    return " ".join(PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0].split())
+
+
+def records(task: str) -> list[Any]:
+    return [json.loads(path.read_text()) for path in sorted((PUBLISHED / task).glob("*/entry.json"))]
+
+
+@pytest.mark.parametrize(
+    ("task", "title", "sentence"),
+    [
+        ("pulse", "Pulses", "It took {:.2f} core-hours, and the 500 runs {:.2f}."),
+        ("vqe-ising", "Three spins", "The searches took {:.2f} core-hours, the 500 runs {:.2f}."),
+        ("clifford", "Clifford operations", "The searches took {:.2f} core-hours, the 400 runs {:.2f}."),
+        ("cartpole", "CartPole with PPO", "The searches took {:.2f} core-hours, the 400 runs {:.2f}."),
+        ("channel", "Error channels", "The searches took {:.2f} core-hours, the 400 runs {:.2f}."),
+    ],
+)
+def test_what_searches_and_runs_took(task: str, title: str, sentence: str) -> None:
+    section = main_section(api.board(task, published=True, runs="none").sections)
+    rows = section.as_dict()["rows"]
+    [(algorithm, _)] = Counter(row["label"].split()[0] for row in rows).most_common(1)
+    rows = [row for row in rows if row["label"].startswith(f"{algorithm} ")]
+    hours = [
+        sum(float(each["core_hours"]) for each in taken) for taken in ([row["tuning"] for row in rows], rows)
+    ]
+    assert sentence.format(*hours) in about(title)
+
+
 def test_what_the_board_of_pulse_took() -> None:
-    text = " ".join(PAGE.partition("\n## Pulses\n")[2].partition("\n## ")[0].split())
-    records = [json.loads(path.read_text()) for path in sorted((PUBLISHED / "pulse").glob("*/entry.json"))]
-    tunings = [record["tuning"] for record in records]
+    text = about("Pulses")
+    tunings = [record["tuning"] for record in records("pulse")]
     assert all(tuning["regret"]["expected"] <= 0.05 for tuning in tunings)
     runs = [tuning["runs"] for tuning in tunings]
     assert f"All entries reached it, after {min(runs)} to {max(runs)} runs each" in text
-    [section] = api.board("pulse", published=True, runs="none").sections
-    spent = [float(row["core_hours"]) for row in section.as_dict()["rows"]]
-    hours = sum(tuning["core_hours"] for tuning in tunings)
-    assert f"It took {hours:.2f} core-hours, and the 500 runs {sum(spent):.2f}." in text
 
 
 def test_what_the_board_of_three_spins_says() -> None:
-    text = " ".join(PAGE.partition("\n## Three spins\n")[2].partition("\n## ")[0].split())
-    records = [
-        json.loads(path.read_text()) for path in sorted((PUBLISHED / "vqe-ising").glob("*/entry.json"))
-    ]
-    tunings = [record["tuning"] for record in records]
+    text = about("Three spins")
+    tunings = [record["tuning"] for record in records("vqe-ising")]
     reached = [t["budget"] == "expected regret 3%" for t in tunings]
     assert sum(reached) == 2
     late = [t for t, done in zip(tunings, reached) if not done]
@@ -110,8 +134,6 @@ def test_what_the_board_of_three_spins_says() -> None:
     assert f"after {min(runs)} to {max(runs)} runs each" in text
     [section] = api.board("vqe-ising", published=True, runs="none").sections
     rows = section.as_dict()["rows"]
-    spent, hours = sum(float(row["core_hours"]) for row in rows), sum(t["core_hours"] for t in tunings)
-    assert f"The searches took {hours:.2f} core-hours, the 500 runs {spent:.2f}." in text
 
     def called(words: str) -> str:
         (found,) = (row["label"] for row in rows if row["label"].startswith(f"ppo {words}"))
@@ -123,7 +145,7 @@ def test_what_the_board_of_three_spins_says() -> None:
     assert "(27% to 38%, 50 seeds each" in said
     assert "with sines it needs 33% fewer steps (27% to 38%)" in text
     for circuit in ("vqc-native model.qubits=4 init", "vqc-native model.qubits=4 layers=5 ansatz=jerbi init"):
-        (record,) = (each for each in records if each["label"] == called(circuit))
+        (record,) = (each for each in records("vqe-ising") if each["label"] == called(circuit))
         assert record["identity"]["algorithm_options"]["quantum_lr"] < 1e-4
         assert round(record["identity"]["algorithm_options"]["lr"], 2) == 0.03
 
@@ -140,9 +162,8 @@ def test_what_the_board_of_three_spins_says() -> None:
 
 
 def test_what_the_board_of_clifford_says() -> None:
-    text = " ".join(PAGE.partition("\n## Clifford operations\n")[2].partition("\n## ")[0].split())
-    records = [json.loads(path.read_text()) for path in sorted((PUBLISHED / "clifford").glob("*/entry.json"))]
-    tunings = {record["label"]: record["tuning"] for record in records}
+    text = about("Clifford operations")
+    tunings = {record["label"]: record["tuning"] for record in records("clifford")}
     reached = {label for label, tuning in tunings.items() if tuning["budget"] == "expected regret 3%"}
     assert {label.split()[1] for label in reached} == {"mlp", "vqc-native"}
     assert len(reached) == 3
@@ -157,10 +178,6 @@ def test_what_the_board_of_clifford_says() -> None:
         f"{regrets['separable'][0]}, mean-field at {regrets['mean-field'][0]}, width 64 at {regrets['width=64'][0]}, "
         f"and tanh at {regrets['tanh'][0]}, after {regrets['tanh'][1]} runs alone."
     ) in text
-    [section] = api.board("clifford", published=True, runs="none").sections
-    spent = sum(float(row["core_hours"]) for row in section.as_dict()["rows"])
-    hours = sum(tuning["core_hours"] for tuning in tunings.values())
-    assert f"The searches took {hours:.2f} core-hours, the 400 runs {spent:.2f}." in text
     pairs = {row[1]: row[2] for row in load("tables").pairs("clifford")}
     for asked, share in (("tanh", "37% more"), ("sines", "30% more"), ("width 6", "4% fewer")):
         assert share in pairs[f"`iqp` against {asked}"]
@@ -176,13 +193,10 @@ def test_what_the_board_of_clifford_says() -> None:
     ],
 )
 def test_what_the_boards_with_ppo_say(task: str, title: str, shares: dict[str, str]) -> None:
-    text = " ".join(PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0].split())
+    text = about(title)
     section = main_section(api.board(task, published=True, runs="none").sections)
     facts = section.as_dict()
     rows = {row["entry"]: row for row in facts["rows"] if row["label"].startswith("ppo ")}
-    hours = sum(row["tuning"]["core_hours"] for row in rows.values())
-    spent = sum(float(row["core_hours"]) for row in rows.values())
-    assert f"The searches took {hours:.2f} core-hours, the 400 runs {spent:.2f}." in text
     pairs = {row[1]: row[2:] for row in load("tables").pairs(task)}
     for asked, share in shares.items():
         assert share in pairs[f"`iqp` against {asked}"][0]
