@@ -4,6 +4,8 @@
     run.json       RunRecord: one seed's run
     epochs.jsonl   EpochLine: one epoch of a seed; epochs.parquet has the same in columns
     timings.jsonl  TimingLine: how long that epoch took
+    looks.jsonl    LookLine: an event of a study with looks
+    evaluations/*.jsonl  RoundLine: the episodes of an evaluation that were played at once
 
 A record has the known keys of its file as attributes. `content` is all of it, in the order of the file, with keys of
 later versions: that is written again. A key that may be absent has a default, with which older records are read.
@@ -573,3 +575,37 @@ class TimingLine(Record):
         """Parts of the seed's core-seconds; by the clock, which other work stretches, without `cpu`."""
         parts = (self.train, self.validate_) if self.cpu is None else (self.cpu,)
         return [part for part in parts if part is not None]
+
+
+class DecidedPair(Record):
+    """Two entries of a study at a look, with their p and the decision, if any."""
+
+    pair: list[str]
+    p: float | None = None
+    decided: str | None = None
+
+
+class LookLine(Record):
+    """An event of the study whose hash is `plan`: it was begun or ended, or a look was taken at so many seeds."""
+
+    what: ClassVar[str] = "a line of a study's log"
+
+    begun: str | None = None
+    ended: str | None = None
+    time: str | None = None
+    plan: str | None = None
+    look: Positive | None = None
+    pairs: list[DecidedPair] = []
+
+
+class RoundLine(Record):
+    """The episodes that P agents played at once in an evaluation: returns and scores (P, lanes), and all steps."""
+
+    what: ClassVar[str] = "a round of an evaluation"
+    cure: ClassVar[str] = "delete the file, and its episodes are played again"
+
+    round: Count
+    lanes: Positive
+    steps: Count
+    returns: list[list[float]]
+    scores: list[list[float | None]]

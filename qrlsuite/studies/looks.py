@@ -32,8 +32,9 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
+from qrlsuite.results.records import DecidedPair, LookLine
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import EntryStore, append, json_line, read_lines, write_atomically
+from qrlsuite.results.store import EntryStore, append, json_line, read_records, write_atomically
 from qrlsuite.statistics import Grid, LearningCurves, SequentialDesign, decide
 from qrlsuite.statistics.sequential import Decision
 from qrlsuite.studies.study import (
@@ -250,14 +251,14 @@ class StudyWithLooks:
         begun = self.check()
         if begun:
             self._require_code_of_new_entries()
-        log = read_lines(self.folder / LOG)
-        if (when := _first(log, "ended")) is not None:
+        log = self._log()
+        if (when := next((line.ended for line in log if line.ended), None)) is not None:
             raise OptionError(
                 f"{self.source}: the study was ended on {when}; a new one needs a name of its own"
             )
         if not begun:
             write_atomically(self.folder / FILE, dumps(self.file).encode())
-            if _first(log, "begun", self.hash) is None:
+            if self._begun_at(log) is None:
                 append(self.folder / LOG, json_line({"begun": _now(), "plan": self.hash}))
 
     def _require_code_of_new_entries(self) -> None:
@@ -300,7 +301,7 @@ class StudyWithLooks:
 
     def read(self) -> StudyState:
         """Read the folder once, and decide by it; writes nothing."""
-        begun, log = self.check(), read_lines(self.folder / LOG)
+        begun, log = self.check(), self._log()
         seeds, curves, hours = dict[str, list[int]](), dict[str, LearningCurves](), dict[str, float]()
         for name, entry in self.entries.items():
             runs = list(self.runs_of(name))
@@ -321,43 +322,42 @@ class StudyWithLooks:
         self._compare(decision, log)
         return StudyState(
             begun=begun,
-            begun_at=_first(log, "begun", self.hash),
-            ended=_first(log, "ended"),
-            taken=dict(
-                sorted({line["look"]: str(line["time"]) for line in reversed(log) if "look" in line}.items())
-            ),
+            begun_at=self._begun_at(log),
+            ended=next((line.ended for line in log if line.ended), None),
+            taken=dict(sorted({line.look: line.time or "" for line in reversed(log) if line.look}.items())),
             seeds=seeds,
             curves=curves,
             hours=hours,
             decision=decision,
         )
 
-    def _compare(self, decision: Decision, log: Sequence[Mapping[str, Any]]) -> None:
+    def _compare(self, decision: Decision, log: Sequence[LookLine]) -> None:
         """Refuse curves by which a look finds something else than the log says."""
         for line in _lines(self.design, decision):
-            for before in log:
-                if before.get("look") != line["look"]:
-                    continue
-                for now, then in zip(line["pairs"], before.get("pairs", [])):
-                    if now["decided"] != then.get("decided"):
+            for before in (before for before in log if before.look == line.look):
+                for now, then in zip(line.pairs, before.pairs):
+                    if now.decided != then.decided:
                         raise StoreError(
-                            f"{self.folder / LOG}: the look at {line['look']} seeds found '{then.get('decided')}' for "
-                            f"{' and '.join(now['pair'])}, and the curves there now give '{now['decided']}': results "
+                            f"{self.folder / LOG}: the look at {line.look} seeds found '{then.decided}' for "
+                            f"{' and '.join(now.pair)}, and the curves there now give '{now.decided}': results "
                             "were changed since; restore them"
                         )
+
+    def _log(self) -> list[LookLine]:
+        return read_records(self.folder / LOG, LookLine)
+
+    def _begun_at(self, log: Sequence[LookLine]) -> str | None:
+        return next((line.begun for line in log if line.begun and line.plan == self.hash), None)
 
     def look(self) -> StudyState:
         """Take every look for which the seeds are there, and note when."""
         state = self.read()
-        new = {
-            line["look"]: line
-            for line in _lines(self.design, state.decision)
-            if line["look"] not in state.taken
-        }
         taken = dict(state.taken)
-        for look, line in new.items():
-            taken[look] = _now()
-            append(self.folder / LOG, json_line({"time": taken[look], "plan": self.hash, **line}))
+        for line in _lines(self.design, state.decision):
+            if line.look is not None and line.look not in state.taken:
+                taken[line.look] = _now()
+                content = {"time": taken[line.look], "plan": self.hash, **line.content}
+                append(self.folder / LOG, json_line(content))
         return replace(state, taken=taken)
 
 
@@ -549,21 +549,21 @@ def _content(file: StudyFile) -> dict[str, Any]:
     return {"format_version": 1, "name": file.name, "task": task, **looks, "entries": entries}
 
 
-def _lines(design: SequentialDesign, decision: Decision) -> list[dict[str, Any]]:
+def _lines(design: SequentialDesign, decision: Decision) -> list[LookLine]:
     """Return the results of each look: for every open pair, its p and how it was closed."""
     lines = []
     for index, look in enumerate(design.looks):
         pairs = [
-            {
-                "pair": [pair.first, pair.second],
-                "p": pair.p[index],
-                "decided": None if pair.decided is None or index < len(pair.p) - 1 else str(pair.decided),
-            }
+            DecidedPair(
+                pair=[pair.first, pair.second],
+                p=pair.p[index],
+                decided=None if pair.decided is None or index < len(pair.p) - 1 else str(pair.decided),
+            )
             for pair in decision.pairs
             if index < len(pair.p)
         ]
         if pairs:
-            lines.append({"look": look, "pairs": pairs})
+            lines.append(LookLine(look=look, pairs=pairs))
     return lines
 
 
@@ -576,12 +576,6 @@ def _names(entries: Sequence[Entry]) -> list[str]:
         chosen = (names[index] for names in (short, labels) if Counter(names)[names[index]] == 1)
         result.append(next(chosen, entry.name))
     return result
-
-
-def _first(log: Sequence[Mapping[str, Any]], key: str, hash_: str | None = None) -> str | None:
-    """Return the time of the first event of a kind in the log, of the study with a hash if one is given."""
-    lines = (line for line in log if key in line and hash_ in (None, line.get("plan")))
-    return next((str(line[key]) for line in lines), None)
 
 
 def _short(value: Any) -> str:

@@ -25,6 +25,7 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.task import Task
+from qrlsuite.results.records import RoundLine
 from qrlsuite.results.store import EntryStore, append, drop_torn_line, json_line, read_lines
 from qrlsuite.seeding import Streams
 from qrlsuite.training.evaluation import (
@@ -220,33 +221,27 @@ class Kept:
         text = json.dumps(description, sort_keys=True)
         self.path = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.jsonl"
         self._description = description
-        self._rounds = {
-            (line["round"], line["lanes"]): line for line in read_lines(self.path) if "round" in line
-        }
+        rounds = [RoundLine.read(line, self.path) for line in read_lines(self.path) if "round" in line]
+        self._rounds = {(line.round, line.lanes): line for line in rounds}
 
     def get(self, block: int, lanes: int) -> Round | None:
         """Return a round (P, lanes), or None."""
         line = self._rounds.get((block, lanes))
         if line is None:
             return None
-        scores = np.array([[np.nan if x is None else x for x in row] for row in line["scores"]])
-        return Round(np.array(line["returns"]), scores, line["steps"])
+        scores = np.array([[np.nan if x is None else x for x in row] for row in line.scores])
+        return Round(np.array(line.returns), scores, line.steps)
 
     def add(self, block: int, lanes: int, played: Round) -> None:
         """Keep a finished round."""
         scores = [[None if np.isnan(x) else x for x in row] for row in played.scores.tolist()]
-        line = {
-            "round": block,
-            "lanes": lanes,
-            "steps": played.steps,
-            "returns": played.returns.tolist(),
-            "scores": scores,
-        }
+        returns = played.returns.tolist()
+        line = RoundLine(round=block, lanes=lanes, steps=played.steps, returns=returns, scores=scores)
         if not self.path.exists():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             append(self.path, json_line(self._description))
         drop_torn_line(self.path)
-        append(self.path, json_line(line))
+        append(self.path, json_line(line.content))
 
 
 def steps_per_episode(

@@ -15,7 +15,16 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard.shelf import PLANS
 from qrlsuite.leaderboard.shelf.published import OF_STUDIES, PUBLISHED, encode_record
-from qrlsuite.results.records import EntryRecord, EpochLine, Provenance, Record, RunRecord, TimingLine
+from qrlsuite.results.records import (
+    EntryRecord,
+    EpochLine,
+    LookLine,
+    Provenance,
+    Record,
+    RoundLine,
+    RunRecord,
+    TimingLine,
+)
 from qrlsuite.results.store import json_line
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -47,7 +56,13 @@ def test_every_stored_run_is_written_again_to_its_bytes() -> None:
     ]
     for path, line in lines:
         assert json_line(EpochLine.read(json.loads(line), path).content) == line
+    logs = [
+        (path, line) for path in PLANS.glob("*/looks.jsonl") for line in path.read_bytes().splitlines(True)
+    ]
+    for path, line in logs:
+        assert json_line(LookLine.read(json.loads(line), path).content) == line
     assert len(lines) > 100
+    assert len(logs) > 80
 
 
 def whole() -> tuple[Path, dict[str, Any]]:
@@ -96,6 +111,11 @@ TIME_CONTENT = {
     "host": "node",
     "time": "now",
 }
+LOOK_CONTENT = {
+    "begun": "now", "ended": "now", "time": "now", "plan": "0", "look": 20,
+    "pairs": [{"pair": ["a", "b"], "p": 0.5, "decided": "equal"}],
+}  # fmt: skip
+ROUND_CONTENT = {"round": 0, "lanes": 2, "steps": 9, "returns": [[1.0, 2.0]], "scores": [[0.5, 0.5]]}
 FREE = {
     "format_version", "identity.task", "identity.algorithm_options", "identity.model_options", "task_file",
     "tuning.space", "provenance.0.device.numba-cuda",
@@ -139,6 +159,8 @@ CASES = [
     *((RunRecord, RUN, RUN_CONTENT, key) for key in keys(RUN_CONTENT)),
     *((EpochLine, LINES, LINE_CONTENT, key) for key in keys(LINE_CONTENT)),
     *((TimingLine, LINES, TIME_CONTENT, key) for key in keys(TIME_CONTENT)),
+    *((LookLine, LINES, LOOK_CONTENT, key) for key in keys(LOOK_CONTENT)),
+    *((RoundLine, LINES, ROUND_CONTENT, key) for key in keys(ROUND_CONTENT)),
 ]
 
 
