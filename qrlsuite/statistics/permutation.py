@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
-from qrlsuite.statistics.bootstrap import Weights, small_product
+from qrlsuite.statistics.bootstrap import small_product
 from qrlsuite.statistics.grid import BoolArray, FloatArray, IntArray
 from qrlsuite.statistics.significance import Evidence, Signs
 from qrlsuite.statistics.times import check_probability, times_below
@@ -62,20 +62,20 @@ def relabelings_for(level: float) -> int:
     return CHUNK * max(1, math.ceil(needed / CHUNK))
 
 
-@functools.lru_cache(maxsize=12)  # all pairs of equal sizes share their relabelings
-def relabelings(n_first: int, n_second: int, chunk: int = 0, seed: int = 0, block: int = 0) -> Weights:
-    """Return, shape (n_first + n_second, 10,000): 1 where a run is labeled "first", n_first times per column.
+@functools.lru_cache(maxsize=48)  # pairs of equal sizes and looks of studies share them; 100 MB at 200 runs
+def relabelings(n_first: int, n_second: int, chunk: int = 0, seed: int = 0, block: int = 0) -> BoolArray:
+    """Return, shape (n_first + n_second, 10,000): whether a run is labeled "first", n_first times per column.
 
     Parameters
     ----------
     n_first, n_second:
         Runs of both entries.
     chunk, seed, block:
-        Others of them give other relabelings, the same the same on every machine.
+        Others of them give other relabelings, the same on every machine.
     """
     generator = np.random.default_rng([seed, block, chunk])
     keys = generator.integers(0, 2**32, size=(CHUNK, n_first + n_second), dtype=np.uint32)
-    labels = np.ascontiguousarray(smallest(keys, n_first).T, dtype=np.float32)
+    labels: BoolArray = np.ascontiguousarray(smallest(keys, n_first).T)
     labels.flags.writeable = False
     return labels
 
@@ -293,16 +293,13 @@ class _Statistics:
             [np.count_nonzero(largest >= each[:, None], axis=1) for each in self.observed], axis=1
         )
 
-    def _sum(self, matrix: NDArray[Any], labels: Sequence[Weights]) -> NDArray[Any]:
+    def _sum(self, matrix: NDArray[Any], labels: Sequence[BoolArray]) -> NDArray[Any]:
         """Return, shape (E P, relabelings), the sum over the runs labeled "first"."""
         ends = np.cumsum([len(each) for each in labels]).tolist()
         total: NDArray[Any] | None = None
         for end, each in zip(ends, labels):
-            columns = matrix[:, end - len(each) : end]
-            if self.kind is np.float32:
-                part: NDArray[Any] = small_product(columns, each)
-            else:
-                part = columns @ each.astype(np.float64)
+            columns, weights = matrix[:, end - len(each) : end], each.astype(self.kind)
+            part = small_product(columns, weights) if self.kind is np.float32 else columns @ weights
             total = part if total is None else np.add(total, part, out=total)
         assert total is not None
         return total
