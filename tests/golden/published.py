@@ -8,7 +8,8 @@ list in its message.
 A group is a file of questions and their answers: commands as one types them, and the data that they print. Wording is
 not kept (of sentences only their numbers), nor what depends on the machine (folders, speeds and hours estimated of
 them). Numbers are equal within `TOLERANCE`, since processors add in different orders; all else is equal. A value, key,
-row or question that is gone or new is a change, too. `tests/leaderboard/test_golden_published.py` reads it.
+row or question that is gone or new is a change, too; the order of keys and columns is not.
+`tests/leaderboard/test_golden_published.py` reads it.
 """
 
 from __future__ import annotations
