@@ -6,7 +6,7 @@ Lanes are seed-major: with S seeds and E environments each, lane = s * E + e.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium
 import numpy as np
@@ -344,6 +344,22 @@ class OneLane(gymnasium.Env[Any, Any]):
     def _shown(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
         shown: NDArray[np.float32] = observations[0].reshape(self.observation_space.shape or ())
         return shown
+
+
+Lanes = TypeVar("Lanes", bound=LaneEnv)
+
+
+def require_lanes(envs: LaneEnv, lanes: type[Lanes]) -> Lanes:
+    """Return `envs` as the lanes that a reference policy looks into.
+
+    Raises
+    ------
+    TypeError
+        If they are other lanes.
+    """
+    if not isinstance(envs, lanes):
+        raise TypeError(f"the policy needs {lanes.__name__}, not {type(envs).__name__}")
+    return envs
 
 
 def arrived(observations: NDArray[Any], infos: Mapping[str, Any]) -> NDArray[Any]:

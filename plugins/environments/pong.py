@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane
+from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane, require_lanes
 from qrlsuite.errors import StoreError
 
 FloatArray = NDArray[np.float64]
@@ -256,9 +256,7 @@ class Follower:
     """The reference policy that follows the ball, once a step: with 8 frames a step it loses most games."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        if not isinstance(envs, PongLanes):
-            raise TypeError(f"a policy of pong needs its lanes, not {type(envs).__name__}")
-        self.envs = envs
+        self.envs = require_lanes(envs, PongLanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return actions (L,)."""

@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane
+from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane, require_lanes
 from qrlsuite.errors import StoreError
 
 FORWARD = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
@@ -252,9 +252,7 @@ class ShortestWay:
     """The reference policy that walks the shortest way, which it knows: a score of 1."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        if not isinstance(envs, RoomLanes):
-            raise TypeError(f"a policy of room needs its lanes, not {type(envs).__name__}")
-        self.envs = envs
+        self.envs = require_lanes(envs, RoomLanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return actions (L,): ahead where that is nearer to the goal, else the turn that is."""

@@ -57,6 +57,14 @@ TasksOption = Annotated[
         autocompletion=names_of("tasks"),
     ),
 ]
+TrainedTaskOption = Annotated[
+    str,
+    typer.Option(
+        "--task",
+        help="A task (see `qrlsuite list tasks`) or a task file's path.",
+        autocompletion=names_of("tasks"),
+    ),
+]
 AmongOption = Annotated[
     str | None, typer.Option("--task", help="Look for ENTRY among the entries of this task only.")
 ]

@@ -14,7 +14,15 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
 from qrlsuite.actions import check_actions
-from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings, require_state
+from qrlsuite.environment import (
+    LaneEnv,
+    OneLane,
+    State,
+    batched_spaces,
+    endings,
+    require_lanes,
+    require_state,
+)
 from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.options import checked
@@ -261,9 +269,7 @@ class BestAngle:
     """The reference policy that knows where the user will be: a score of 1, where the beam turns fast enough."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        if not isinstance(envs, AngleLanes):
-            raise TypeError(f"a policy of beam-angle needs its lanes, not {type(envs).__name__}")
-        self.envs = envs
+        self.envs = require_lanes(envs, AngleLanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the turns to the best angles, or these (L, 1)."""

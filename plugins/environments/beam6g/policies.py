@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.environment import LaneEnv
+from qrlsuite.environment import LaneEnv, require_lanes
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.vector import BeamLanes
 
@@ -14,7 +14,7 @@ class Optimal:
     """Serves the user by the antenna that is best at its next position: a score of 1 (paper: "ground truth")."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, BeamLanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the antennas (L,)."""
@@ -32,7 +32,7 @@ class NearestAntenna:
     """
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, BeamLanes)
         self._nearest = np.zeros((envs.num_envs, self.envs.options.steps + 1), dtype=np.int64)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -50,9 +50,3 @@ class NearestAntenna:
         squared = [(x - a) ** 2 + (y - b) ** 2 for (a, b), _ in self.envs.options.antennas]
         nearest: NDArray[np.int64] = np.argmin(squared, axis=0).astype(np.int64)
         return nearest
-
-
-def _lanes(envs: LaneEnv) -> BeamLanes:
-    if not isinstance(envs, BeamLanes):
-        raise TypeError(f"a policy of beam6g needs its lanes, not {type(envs).__name__}")
-    return envs

@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
 
@@ -224,9 +224,7 @@ class Informative:
     """
 
     def __init__(self, envs: LaneEnv) -> None:
-        if not isinstance(envs, ChannelLanes):
-            raise TypeError(f"a policy of channel needs its lanes, not {type(envs).__name__}")
-        self.envs = envs
+        self.envs = require_lanes(envs, ChannelLanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> IntArray:
         """Return actions (L,)."""

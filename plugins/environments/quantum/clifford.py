@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
@@ -220,12 +220,6 @@ class CliffordLanes(EpisodeLanes):
         return bool(np.isin(left, (0, 1)).all() and (left @ form @ left.swapaxes(1, 2) % 2 == form).all())
 
 
-def _lanes(envs: LaneEnv) -> CliffordLanes:
-    if not isinstance(envs, CliffordLanes):
-        raise TypeError(f"a policy of clifford needs its lanes, not {type(envs).__name__}")
-    return envs
-
-
 def codes(left: IntArray) -> IntArray:
     """Return bits (..., 2n, 2n), n <= 3, as one whole number each."""
     flat = left.reshape(*left.shape[:-2], -1)
@@ -265,7 +259,7 @@ class ShortestCircuit:
     """The reference policy that plays a shortest circuit, known by exhaustion: an optimum for two and three qubits."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, CliffordLanes)
         if self.envs.options.qubits == 4:
             raise OptionError("environment 'clifford': shortest circuits of four qubits are not known")
         self._known, self._far = distances(
@@ -288,7 +282,7 @@ class GreedyCircuit:
     """The reference policy that takes the first gate after which fewest bits differ from the identity."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, CliffordLanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> IntArray:
         """Return actions (L,)."""

@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import (
@@ -321,17 +321,11 @@ class PulseLanes(EpisodeLanes):
         return bool(np.allclose(np.trace(rho, axis1=1, axis2=2), 1) and np.isfinite(state["error"]).all())
 
 
-def _lanes(envs: LaneEnv) -> PulseLanes:
-    if not isinstance(envs, PulseLanes):
-        raise TypeError(f"a policy of pulse needs its lanes, not {type(envs).__name__}")
-    return envs
-
-
 class GreedyPulse:
     """The reference policy that takes the strength (of 2 or 11 a field) with the highest fidelity after the step."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, PulseLanes)
         discrete = self.envs.options.control == "bang-bang"
         grid = [0.0, 1.0] if discrete else np.linspace(0.0, 1.0, 11).tolist()
         self._tried = np.array(list(product(grid, repeat=self.envs.options.qubits)))
@@ -358,7 +352,7 @@ class BestPulse:
     """
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, PulseLanes)
         options = self.envs.options
         half = (options.steps + 1) // 2
         if options.control == "bang-bang" and 2 ** (options.qubits * half) > EXHAUSTED:

@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.compiled import optimize
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, pauli
@@ -273,12 +273,6 @@ class VQELanes(EpisodeLanes):
         )
 
 
-def _lanes(envs: LaneEnv) -> VQELanes:
-    if not isinstance(envs, VQELanes):
-        raise TypeError(f"a policy of vqe needs its lanes, not {type(envs).__name__}")
-    return envs
-
-
 def _longer(
     envs: VQELanes, which: IntArray, gates: IntArray, angles: FloatArray, counts: IntArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -294,7 +288,7 @@ class GreedyGate:
     """The reference policy that appends the gate after which the energy is lowest, the first of several."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, VQELanes)
 
     def __call__(self, observations: NDArray[np.float32]) -> IntArray:
         """Return actions (L,)."""
@@ -314,7 +308,7 @@ class BestCircuit:
     """
 
     def __init__(self, envs: LaneEnv) -> None:
-        self.envs = _lanes(envs)
+        self.envs = require_lanes(envs, VQELanes)
         self._plan = _searched(self.envs.options)
 
     def __call__(self, observations: NDArray[np.float32]) -> IntArray:

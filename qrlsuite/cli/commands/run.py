@@ -13,7 +13,14 @@ import typer
 from qrlsuite import options, registry, specs
 from qrlsuite.api.arguments import where_of
 from qrlsuite.api.training import resolve_entry, train_entry
-from qrlsuite.cli.arguments import JsonOption, RunsOption, entries_here, names_of, split_settings
+from qrlsuite.cli.arguments import (
+    JsonOption,
+    RunsOption,
+    TrainedTaskOption,
+    entries_here,
+    names_of,
+    split_settings,
+)
 from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
@@ -36,14 +43,7 @@ QUICK_QUBITS = 4
 
 
 def run(
-    task: Annotated[
-        str,
-        typer.Option(
-            "--task",
-            help="A task (see `qrlsuite list tasks`) or a task file's path.",
-            autocompletion=names_of("tasks"),
-        ),
-    ],
+    task: TrainedTaskOption,
     entry: Annotated[
         list[str] | None,
         typer.Argument(

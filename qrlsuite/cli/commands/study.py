@@ -18,7 +18,7 @@ from qrlsuite.api.studies import (
     require_unchanged,
     take_looks,
 )
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, split_settings
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, TrainedTaskOption, split_settings
 from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
@@ -78,9 +78,7 @@ def new(
             "with a name: 'wide: mlp width=64'.",
         ),
     ],
-    task: Annotated[
-        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
-    ],
+    task: TrainedTaskOption,
     epochs: EpochsOption = None,
     looks: Annotated[
         str,

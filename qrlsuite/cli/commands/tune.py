@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api.arguments import where_of
-from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TrainedTaskOption
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -51,9 +51,7 @@ def tune(
             "budgets.",
         ),
     ],
-    task: Annotated[
-        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
-    ],
+    task: TrainedTaskOption,
     vary: Annotated[
         list[str] | None,
         typer.Option(
@@ -108,7 +106,7 @@ def tune(
         typer.Option("--out", metavar="FILE.toml", help="The preset file; default: below --runs."),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help=f"Start a search of more than {LARGE} trials.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and stop.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what it would train, and stop.")] = False,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     device: DeviceOption = "cpu",
