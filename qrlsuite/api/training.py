@@ -229,7 +229,7 @@ def tune(
         `bayesian` tries first, `"lr=.002 buffer=10000"`. `bayesian` also varies the options that models and algorithms
         mark as `Tuned`.
     sampler:
-        `bayesian`, `grid`, `one-at-a-time`, `random` or `tpe`, with options `trials` and `seed`: `"random trials=50"`;
+        `bayesian`, `grid` or `random`, with options `trials` and `seed`: `"random trials=50"`;
         `"bayesian regret=.03"`. None takes all combinations of the lists in `vary`, and `bayesian` without lists.
     seeds:
         Runs of each trial: a number counts from seed 1,000,000. None takes 20, with `bayesian` 4.

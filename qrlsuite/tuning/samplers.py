@@ -5,25 +5,22 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 import pydantic
 
 from qrlsuite import notation, options
-from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.tuning.space import Dimension, Point, Space
 
 NAMES = {
     "bayesian": "settings that may be the best by a smooth surrogate, until the expected regret is small",
     "grid": "every combination",
-    "one-at-a-time": "each option through its values, the others untuned",
     "random": "combinations drawn at random, none twice",
-    "tpe": "proposals of Optuna's tree-structured Parzen estimator, after earlier trials",
 }
 
 REGRET = 0.05
@@ -47,51 +44,29 @@ def read(text: str) -> tuple[str, SamplerOptions]:
     return name, options.build(SamplerOptions, values, f"sampler '{name}'")
 
 
-class Sampler(Protocol):
-    """Proposes points one by one."""
-
-    total: int
-    """How many points there will be."""
-    adaptive: bool
-    """Whether a proposal depends on the values of earlier trials."""
-
-    def ask(self) -> Point:
-        """Return the next point."""
-
-    def tell(self, value: float) -> None:
-        """Take the value, to be minimized, of the point asked for last."""
-
-
-def create(name: str, space: Space, trials: int | None, seed: int, base: Point) -> Sampler:
-    """Build a sampler.
+def points(name: str, space: Space, trials: int | None, seed: int) -> list[Point]:
+    """Return the settings to try, in their order, by `grid` or `random`.
 
     Parameters
     ----------
     trials:
-        How many points to propose; None for all, which only a grid and `one-at-a-time` have.
-    base:
-        The point of settings without tuning, from which `one-at-a-time` starts.
+        How many; None for a whole grid.
     """
-    if name not in NAMES or name == "bayesian":  # which is a search of its own, and goes back to known points
-        raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")
-    ranges = [dimension.name for dimension in space if dimension.range is not None]
-    if name in ("grid", "one-at-a-time"):
-        if ranges:
-            raise OptionError(
-                f"{ranges[0]} is a range, which sampler '{name}' cannot go through: give a list, or use "
-                "--sampler random or tpe"
-            )
-        if trials is not None and not (name == "grid" and trials >= size(space)):
-            raise OptionError(
-                f"trials is for samplers that draw: --sampler 'random trials={trials}' takes as many of the "
-                f"{size(space)} combinations"
-            )
-        return Listed(product(space) if name == "grid" else one_at_a_time(space, base))
-    if trials is None:
-        raise OptionError(f"--sampler {name}: write the number of settings to try, '{name} trials=50'")
     if name == "random":
-        return Listed(random_points(space, trials, seed))
-    return Tpe(space, trials, seed)
+        if trials is None:
+            raise OptionError("--sampler random: write the number of settings to try, 'random trials=50'")
+        return list(random_points(space, trials, seed))
+    ranges = [dimension.name for dimension in space if dimension.range is not None]
+    if ranges:
+        raise OptionError(
+            f"{ranges[0]} is a range, which sampler 'grid' cannot go through: give a list, or use --sampler random"
+        )
+    if trials is not None and trials < size(space):
+        raise OptionError(
+            f"trials is for samplers that draw: --sampler 'random trials={trials}' takes as many of the {size(space)} "
+            "combinations"
+        )
+    return list(product(space))
 
 
 def size(space: Space) -> int:
@@ -103,15 +78,6 @@ def product(space: Space) -> Iterator[Point]:
     """Return every combination, the last option changing fastest."""
     for values in itertools.product(*(dimension.values for dimension in space)):
         yield {dimension.name: value for dimension, value in zip(space, values)}
-
-
-def one_at_a_time(space: Space, base: Point) -> Iterator[Point]:
-    """Return the base, then each option's other values in turn."""
-    yield dict(base)
-    for dimension in space:
-        for value in dimension.values:
-            if value != base[dimension.name]:
-                yield {**base, dimension.name: value}
 
 
 def random_points(space: Space, trials: int, seed: int) -> Iterator[Point]:
@@ -141,72 +107,3 @@ def _draw(dimension: Dimension, generator: np.random.Generator) -> Any:
 def _short(value: float) -> float:
     """Round to four digits, so that a preset file can be read."""
     return float(f"{value:.4g}")
-
-
-class Listed:
-    """A list of points, fixed beforehand."""
-
-    adaptive = False
-
-    def __init__(self, points: Iterator[Point]) -> None:
-        self._points = list(points)
-        self._next = 0
-        self.total = len(self._points)
-
-    def ask(self) -> Point:
-        """Return the next point."""
-        self._next += 1
-        return dict(self._points[self._next - 1])
-
-    def tell(self, value: float) -> None:
-        """Do nothing: the points do not depend on values."""
-
-
-class Tpe:
-    """Optuna's tree-structured Parzen estimator (Bergstra et al. 2011), with a fixed seed.
-
-    The study lives in memory. A repeated search asks and tells in the same order, and so replays it: only the runs
-    are stored.
-    """
-
-    adaptive = True
-
-    def __init__(self, space: Space, trials: int, seed: int) -> None:
-        if importlib.util.find_spec("optuna") is None:
-            raise QrlSuiteError("--sampler tpe needs the package 'optuna': pip install 'qrlsuite[tune]'")
-        import optuna  # an extra, which other samplers do without
-
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.space, self.total = space, trials
-        self._study = optuna.create_study(
-            direction="minimize", sampler=optuna.samplers.TPESampler(seed=seed % 2**32)
-        )
-        self._distributions = {dimension.name: self._distribution(dimension) for dimension in space}
-        self._trial: Any = None
-
-    def _distribution(self, dimension: Dimension) -> Any:
-        from optuna import distributions  # as above
-
-        ends = dimension.range
-        if ends is None:  # by position: values may be lists, which Optuna does not take
-            return distributions.CategoricalDistribution(tuple(range(len(dimension.values))))
-        if ends.integer:
-            return distributions.IntDistribution(int(ends.low), int(ends.high), log=ends.log)
-        return distributions.FloatDistribution(float(ends.low), float(ends.high), log=ends.log)
-
-    def ask(self) -> Point:
-        """Return the next point."""
-        self._trial = self._study.ask(self._distributions)
-        point = {}
-        for dimension in self.space:
-            value = self._trial.params[dimension.name]
-            if dimension.range is None:
-                value = dimension.values[value]
-            elif isinstance(value, float):
-                value = min(max(_short(value), dimension.range.low), dimension.range.high)
-            point[dimension.name] = value
-        return point
-
-    def tell(self, value: float) -> None:
-        """Take the value of the point asked for last."""
-        self._study.tell(self._trial, value)

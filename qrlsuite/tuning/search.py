@@ -243,13 +243,7 @@ class Search(Shown):
     def _begin(self) -> None:
         request = self.request
         self.space = self._space(request.grid is None and not request.varied)
-        self.sampler = samplers.create(
-            request.sampler,
-            self.space,
-            request.trials,
-            request.sampler_seed,
-            space.base(self.space, self.base),
-        )
+        self.points = samplers.points(request.sampler, self.space, request.trials, request.sampler_seed)
 
     def _space(self, declared: bool) -> space.Space:
         """Return the search space; `declared` adds the ranges that algorithm and model declare."""
@@ -260,7 +254,7 @@ class Search(Shown):
     @property
     def planned(self) -> int:
         """How many trials there are to be."""
-        return self.sampler.total
+        return len(self.points)
 
     @property
     def runs_planned(self) -> int:
@@ -298,13 +292,13 @@ class Search(Shown):
 
     @property
     def over(self) -> bool:
-        """Whether no further trial can be begun: all are, or the next one needs to know one that waits."""
-        return self.asked == self.planned or (self.sampler.adaptive and bool(self.pending))
+        """Whether no further trial can be begun."""
+        return self.asked == self.planned
 
     @property
     def beside(self) -> int:
         """How many settings can be trained side by side in one population, at most: what a run costs depends on it."""
-        return self.planned if self._per_agent and not self.sampler.adaptive else 1
+        return self.planned if self._per_agent else 1
 
     @property
     def _per_agent(self) -> bool:
@@ -330,15 +324,8 @@ class Search(Shown):
         list
             A trial is None where some of its runs are left to another process or a queue.
         """
-        count = 1 if self.sampler.adaptive else min(most, self.planned - self.asked)
-        proposals = [
-            Proposal(self.asked + i, self.sampler.ask(), self.request.seeds) for i in range(1, count + 1)
-        ]
-        trials = self._try(proposals, train)
-        for trial in trials:
-            if trial is not None:
-                self.sampler.tell(trial.merit.signal)
-        return trials
+        begun = enumerate(self.points[self.asked : self.asked + most], start=self.asked + 1)
+        return self._try([Proposal(number, point, self.request.seeds) for number, point in begun], train)
 
     def _try(self, proposals: Sequence[Proposal], train: Train) -> list[Trial | None]:
         """Train settings on the same seeds and look at their curves; None where some are left to others."""
@@ -413,7 +400,6 @@ class Search(Shown):
             registry.load().get(type(spec), spec.name).distribution
             for spec in (best.entry.model, best.entry.algorithm)
         ]
-        extra = ["optuna"] if self.request.sampler == "tpe" else []
         how = self._how()
         trained = [f"trials trained on {', '.join(sorted(self._gpus))}"] if self._gpus else []
         notes = [text for text in (how.get("note"), *trained) if text]
@@ -432,7 +418,7 @@ class Search(Shown):
                 runs=self.runs_done,
                 epochs=self.epochs,
                 steps=self.runs_done * self.steps_per_run,
-                versions=provenance.collect([*plugins, *extra]).versions,
+                versions=provenance.collect(plugins).versions,
                 core_hours=float(f"{self.core_seconds / 3600:.3g}"),
                 **{**how, "note": "; ".join(notes) or None},
             ),

@@ -29,10 +29,10 @@ def stop(words: list[str], hold: Hold, sign: signal.Signals) -> tuple[int, str]:
 def test_a_search_that_is_stopped_leaves_the_best_settings_so_far(
     tiny_task: str, tmp_path: Path, hold: Hold
 ) -> None:
-    words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3,1e-4"]
-    words += ["--sampler", "tpe trials=3", "--seeds", "1", "--epochs", "8"]
-    words += ["--workers", "1", "--runs", str(tmp_path / "runs")]
-    say(*words, "--budget", "0.01s")  # one trial
+    words = ["tune", "mlp", "--task", tiny_task, "--vary", "width=3,4,5", "--seeds", "1", "--epochs", "8"]
+    words += ["--workers", "1", "--runs", str(tmp_path / "runs"), "--budget"]
+    say(*words, "0.01s")  # one trial
+    words += ["1h"]  # without a pace, one trial at a time
     (path,) = (tmp_path / "runs" / "tuning").glob("*.toml")
     path.unlink()
     code, message = stop(words, hold, signal.SIGTERM)

@@ -86,11 +86,8 @@ def without_hours(text: str) -> str:
     return "\n".join(line for line in text.splitlines() if not line.startswith("core_hours"))
 
 
-@pytest.mark.parametrize("sampler", ["grid", "tpe"])
-def test_a_search_that_was_stopped_ends_with_the_same_preset(
-    sampler: str, tiny_task: str, tmp_path: Path
-) -> None:
-    wanted = request(tiny_task, sampler=sampler, trials=3 if sampler == "tpe" else None)
+def test_a_search_that_was_stopped_ends_with_the_same_preset(tiny_task: str, tmp_path: Path) -> None:
+    wanted = request(tiny_task)
     straight = search.Search(wanted, tmp_path / "straight")
     finish(straight)
     with pytest.raises(KeyboardInterrupt):
@@ -282,24 +279,12 @@ def test_an_unknown_option_is_named_as_it_was_typed(tiny_task: str) -> None:
         space.space(entry, None, [space.parse_varied("widht=8,16")])
 
 
-def test_one_at_a_time_starts_at_what_is_untuned(tiny_task: str) -> None:
-    what = search.Search(request(tiny_task, sampler="one-at-a-time"), Path("nowhere"))
-    points = [tuple(what.sampler.ask().values()) for _ in range(what.planned)]
-    assert points == [(5e-4, 0.95), (1e-2, 0.95), (1e-3, 0.95), (5e-4, 0.9), (5e-4, 0.99)]
-
-
-@pytest.mark.parametrize("sampler", ["random", "tpe"])
-def test_drawn_points_repeat_extend_and_stay_in_range(sampler: str, tiny_task: str) -> None:
+def test_drawn_points_repeat_extend_and_stay_in_range(tiny_task: str) -> None:
     words = varied("lr={low = 1e-4, high = 1e-2, log = true}", "batch={low = 8, high = 64}", "gamma=.9,.99")
     dimensions = space.space(resolve(tiny_task, "mlp"), None, words)
 
     def points(trials: int, seed: int = 0) -> list[space.Point]:
-        made = samplers.create(sampler, dimensions, trials, seed, {})
-        found = []
-        for _ in range(made.total):
-            found.append(made.ask())
-            made.tell(float(found[-1]["algorithm.lr"]))
-        return found
+        return samplers.points("random", dimensions, trials, seed)
 
     twelve = points(12)
     assert points(12) == twelve
@@ -310,31 +295,27 @@ def test_drawn_points_repeat_extend_and_stay_in_range(sampler: str, tiny_task: s
 
 
 def test_random_combinations_are_distinct_and_no_more_than_there_are(tiny_task: str) -> None:
-    made = samplers.create(
-        "random", space.space(resolve(tiny_task, "mlp"), None, varied("lr=.1,.2,.3")), 9, 0, {}
-    )
-    assert sorted(made.ask()["algorithm.lr"] for _ in range(made.total)) == [0.1, 0.2, 0.3]
+    dimensions = space.space(resolve(tiny_task, "mlp"), None, varied("lr=.1,.2,.3"))
+    points = samplers.points("random", dimensions, 9, 0)
+    assert sorted(point["algorithm.lr"] for point in points) == [0.1, 0.2, 0.3]
 
 
 def test_small_ranges_are_drawn_until_nothing_new_comes(tiny_task: str) -> None:
     dimensions = space.space(resolve(tiny_task, "mlp"), None, varied("batch={low = 1, high = 4}"))
-    made = samplers.create("random", dimensions, 10, 0, {})
-    assert sorted(made.ask()["algorithm.batch"] for _ in range(made.total)) == [1, 2, 3, 4]
+    points = samplers.points("random", dimensions, 10, 0)
+    assert sorted(point["algorithm.batch"] for point in points) == [1, 2, 3, 4]
 
 
 def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Path) -> None:
     def elsewhere(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         return [EntryStore.create(tmp_path, entry) for entry in entries]
 
-    for sampler, begun in (("grid", 4), ("tpe", 1)):
-        what = search.Search(
-            request(tiny_task, sampler=sampler, trials=None if sampler == "grid" else 4), tmp_path
-        )
-        while not what.over:
-            assert what.step(elsewhere) == [None]
-        assert (what.asked, len(what.pending)) == (begun, begun)
-        with pytest.raises(OptionError, match="no trial has finished"):
-            what.preset()
+    what = search.Search(request(tiny_task), tmp_path)
+    while not what.over:
+        assert what.step(elsewhere) == [None]
+    assert (what.asked, len(what.pending)) == (4, 4)
+    with pytest.raises(OptionError, match="no trial has finished"):
+        what.preset()
 
 
 @pytest.mark.parametrize(
@@ -352,20 +333,13 @@ def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Pat
         ({"varied": varied("lr={low = 1, high = inf}")}, "finite"),
         ({"varied": varied("lr={low = 1, high = 2}")}, "is a range, which sampler 'grid' cannot go through"),
         ({"trials": 2}, "--sampler 'random trials=2'"),
-        ({"sampler": "tpe"}, "'tpe trials=50'"),
-        ({"sampler": "gird"}, "did you mean 'grid'"),
+        ({"sampler": "random"}, "'random trials=50'"),
     ],
 )
 def test_bad_requests(changes: dict[str, Any], message: str, tiny_task: str) -> None:
     with pytest.raises(QrlSuiteError) as refused:
         search.Search(request(tiny_task, **changes), Path("nowhere"))
     assert message in str(refused.value)
-
-
-def test_a_missing_optuna_is_named_with_the_command(tiny_task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(samplers.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(QrlSuiteError, match=r"pip install 'qrlsuite\[tune\]'"):
-        search.Search(request(tiny_task, sampler="tpe", trials=2), Path("nowhere"))
 
 
 GOOD = 'format_version = 1\nalgorithm = "ddqn"\nmodel = "mlp"\n'

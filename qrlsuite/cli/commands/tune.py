@@ -67,9 +67,9 @@ def tune(
         typer.Option(
             "--sampler",
             metavar="NAME",
-            help="Until the expected regret is small (`bayesian`), all combinations (`grid`), `one-at-a-time`, "
-            "`random` or Optuna's `tpe`, with `trials` and `seed`: 'random trials=50', 'bayesian regret=.03 "
-            "trials=50' (per varied option). Default: bayesian, or all combinations of a --vary.",
+            help="Until the expected regret is small (`bayesian`), all combinations (`grid`), or `random`, with "
+            "`trials` and `seed`: 'random trials=50', 'bayesian regret=.03 trials=50' (per varied option). Default: "
+            "bayesian, or all combinations of a --vary.",
         ),
     ] = None,
     seeds: Annotated[
@@ -148,7 +148,7 @@ def _require_few(searches: Sequence[Search]) -> None:
     if planned > LARGE:
         raise OptionError(
             f"{planned} trials are many: --yes starts them all, --budget 2h as many as that holds, "
-            "--sampler one-at-a-time or --sampler 'random trials=50' tries fewer"
+            "--sampler 'random trials=50' tries fewer"
         )
 
 
