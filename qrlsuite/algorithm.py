@@ -94,8 +94,8 @@ class Algorithm(Protocol):
         episode is a state of its own, forgotten where an episode begins. The memory of training is a separate state,
         in `state_dict`; neither is in `policy_state`.
 
-        An algorithm whose network makes a policy may have a method `information(outputs)`: for what the first network
-        that it built returned, (S, B, outputs) float64, the Fisher information (S, B, outputs, outputs) of the actions'
+        An algorithm whose network makes a policy may have a method `information(outputs)`: for outputs (S, B, outputs)
+        float64 of the first network that it built, the Fisher information (S, B, outputs, outputs) of the actions'
         distribution. Without it, `qrlsuite diagnose` takes outputs for values.
         """
 

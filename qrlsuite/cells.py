@@ -70,7 +70,7 @@ class _Gathered:
         self._pieces.append(source)
 
     def _needs(self, source: str, tree: ast.Module, lines: list[str]) -> None:
-        """Add what a piece of source names."""
+        """Add the names that a piece of source uses."""
         scope = vars(sys.modules[MAIN])
         for word in dict.fromkeys(_globals(symtable.symtable(source, "<cell>", "exec"))):
             if word in self._known or (word not in scope and hasattr(builtins, word)):

@@ -1,7 +1,7 @@
 """Runs any Gymnasium environment in lanes, for environments that have no vector form.
 
 The state of an arbitrary environment cannot be copied. But an episode is fixed by the seed of its reset and by
-its actions, so these are what a checkpoint holds, and resuming plays them again.
+its actions, so a checkpoint holds these, and resuming plays them again.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ class GymLanes(LaneEnv):
         Raises
         ------
         qrlsuite.errors.StoreError
-            If an array is missing or has another shape, or an environment does not do again what it did.
+            If an array is missing or has another shape, or an environment does not repeat its steps.
         """
         shapes = {"seed": (self.num_envs,), "actions": self._actions.shape, "observation": self._raw.shape}
         require_state(f"environment '{self.env_id}'", state, shapes)
@@ -446,7 +446,7 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     20 seeds, 100 epochs of 1000 steps in 10 environments, 20 validation episodes. Thresholds on the return are
     derived from the `reward_threshold` T at which Gymnasium counts the environment as solved: T - |T|,
     T - |T|/2, T - |T|/4 and T, the last one shown first. Where Gymnasium knows none, the one threshold is 0:
-    a task file is needed to say what a good return is. A threshold that random actions reach in each of 10 episodes
+    a task file is needed to define a good return. A threshold that random actions reach in each of 10 episodes
     tells nothing apart, and is left out; where none is left, the highest of these returns is the threshold. The
     summary says so. Without a time limit, episodes are cut at 1000 steps. DDQN has `QUICK_DDQN`.
 

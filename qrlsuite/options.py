@@ -72,7 +72,7 @@ class Tuned:
     With `per_agent=True`, agents of one population may have different values of the option, and a search trains many
     of its settings side by side in one population. `build` of a model gets each agent's own options. An algorithm's
     factory, and `population` of a model, get a float64 tensor (S,) of the agents' values where these differ, and the
-    number where they do not: each agent must become, bit for bit, what it becomes alone. `qrlsuite check` verifies it.
+    number where they do not: each agent must end, bit for bit, as if trained alone. `qrlsuite check` verifies it.
 
     Attributes
     ----------

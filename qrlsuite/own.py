@@ -271,14 +271,14 @@ def load(path: str | os.PathLike[str]) -> Loaded:
     Raises
     ------
     PluginError
-        If there is none, it raises when it is imported, it registers nothing, or what another has registered. Nothing
-        of it is registered then.
+        If there is none, it raises when it is imported, it registers nothing, or a name that another plugin has
+        registered. Nothing of it is registered then.
     """
     return load_source(read(path))
 
 
 def load_named(paths: Any, folder: Path | None, source: str) -> None:
-    """Load what a TOML file names under `plugins`.
+    """Load the plugins that a TOML file names under `plugins`.
 
     Parameters
     ----------
@@ -472,7 +472,7 @@ def is_free(module: str) -> bool:
 
 
 def failure(error: BaseException) -> str:
-    """Say what a plugin's code raised, and in which of its lines."""
+    """Return the error of a plugin's code with its line, in words."""
     what = " ".join(registry.words(error).split())
     if not (where := place(error)):
         last = traceback.extract_tb(error.__traceback__)[-1:]
@@ -522,7 +522,7 @@ def placed(error: OptionError) -> OptionError:
 
 @contextlib.contextmanager
 def blamed() -> Iterator[None]:
-    """Turn what a plugin's code raises into one message with its line; errors of the suite's own code stay.
+    """Turn errors of a plugin's code into one message with its line; errors of the suite's own code stay.
 
     Raises
     ------
@@ -582,7 +582,7 @@ def _forget(source: Source) -> None:
 
 
 def register(thing: Any, place: str) -> bool:
-    """Note what a plugin registers that is being imported; returns whether there is one.
+    """Note a registration of the plugin that is being imported; return whether there is one.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Specs: what a plugin registers. A spec has a name, a one-line summary and *references* to code.
+"""Specs, which plugins register. A spec has a name, a one-line summary and *references* to code.
 
 A reference is a string `"package.module:Name"`. It is resolved only by the command that needs it, so that
 registering imports neither torch nor PennyLane nor Qiskit, and `qrlsuite list` answers at once.
@@ -24,7 +24,7 @@ NO_MODEL = "none"
 
 
 def resolve(reference: str) -> Any:
-    """Import what a reference `"package.module:Name"` points at; `"package.module:Name[key]"` is `Name["key"]`.
+    """Import the target of a reference `"package.module:Name"`; `"package.module:Name[key]"` is `Name["key"]`.
 
     Raises
     ------
@@ -131,8 +131,8 @@ class EnvironmentSpec(NumericSpec):
     policies:
         Reference policies for `qrlsuite evaluate`, by name: each a reference to `factory(envs) -> policy`,
         called when all lanes of the `LaneEnv` have been reset, and `policy(observations) -> actions` maps
-        observations (num_envs, ...) to actions (num_envs, ...). It may look into `envs`, and so know what no
-        agent is shown. Uniformly random actions need no policy.
+        observations (num_envs, ...) to actions (num_envs, ...). It may look into `envs`, and so know more than
+        agents do. Uniformly random actions need no policy.
     pictures:
         Pictures of it for `qrlsuite plot`.
     views:
@@ -369,7 +369,7 @@ class TrackerSpec(Spec):
     ----------
     factory:
         Reference to `factory(target) -> tracker`, called once in every worker. `target` is the text after the
-        equals sign, or None. For what a tracker is, see `qrlsuite.training.trackers`.
+        equals sign, or None. `qrlsuite.training.trackers` defines a tracker.
     extras:
         Packages that it needs: the pip command by the name of the module.
     always:

@@ -50,7 +50,7 @@ def compose(
     settings: Mapping[str, Any],
     environment: Mapping[str, Any],
 ) -> Composed:
-    """Choose what a picture shows, and draw it.
+    """Choose the entries of a picture, and draw it.
 
     Parameters
     ----------

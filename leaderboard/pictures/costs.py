@@ -48,8 +48,8 @@ class CostsOptions:
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw S_hat of each entry at one cell, with its 5th to 95th percentile, in each unit on a logarithmic axis.
 
-    An entry's steps are converted by what a step of it cost in all, see `qrlsuite.leaderboard.boards.costs.price`. An
-    entry without such a cost (networks execute no circuits, exact values take no shots) has no point there.
+    An entry's steps are converted by the price of its step, see `qrlsuite.leaderboard.boards.costs.price`. An entry
+    without a price (networks execute no circuits, exact values take no shots) has no point there.
     """
     chosen: CostsOptions = options.build(CostsOptions, settings, "picture 'costs'")
     cells.one_task(entries, "costs")

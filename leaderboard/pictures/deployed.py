@@ -34,7 +34,7 @@ class DeployedOptions:
 
 
 def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figure:
-    """Draw the mean score of an entry's agents against the values, with what each agent earns as dots.
+    """Draw the mean score of an entry's agents against the values, with each agent's score as a dot.
 
     Agents that act as trained are a horizontal line: dashed for circuits, dotted for networks. On a task
     without a known maximum the picture shows returns.

@@ -257,7 +257,7 @@ def best(copies: Iterable[EntryResults]) -> EntryResults:
 def united(copies: Sequence[EntryResults]) -> tuple[EntryResults, str]:
     """Return the union of an entry's copies; or where it cannot be, the best copy, and why.
 
-    Copies of another code are left out, and those that get less far towards the task's shortest horizon.
+    Copies of another code are left out, and shorter copies within the task's shortest horizon.
     """
     further = best(copies)
     far = _weight(further)[0]

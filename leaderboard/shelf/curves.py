@@ -52,8 +52,7 @@ class SeedResult:
     diverged:
         The first epoch after which its agent's numbers were not finite.
     measured:
-        By name, what the environment measured of each epoch's validation, see
-        `qrlsuite.results.store.SeedRun.measured`.
+        Metrics of the environment by name, see `qrlsuite.results.store.SeedRun.measured`.
     parameters:
         Numbers of its agent: `classical` and `quantum` ones that are trained, summed over `networks`; `fixed` ones.
     made_with:
@@ -121,11 +120,11 @@ class EntryResults(Shown):
     epochs:
         T of `curves`.
     folder:
-        Where it was read; of a sum, that of the results with more seeds.
+        Folder of its files; for a sum, the folder of the results with more seeds.
     mark:
         What follows its name where seeds of one name are shown apart.
     refused:
-        One line for each seed that does not count, because a file of it is damaged or it is not what it says.
+        One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
     chosen_seeds:
         Why no board ranks it, of a published entry whose seeds may have been chosen; empty otherwise.
     color:
@@ -265,7 +264,7 @@ class EntryResults(Shown):
 
     @cached_property
     def counts(self) -> Mapping[str, int]:
-        """The numbers of an agent; those of older versions, without `networks`, only where no seed has newer ones."""
+        """The numbers of an agent; numbers of older versions, without `networks`, only if no seed has newer ones."""
         counts = [result.parameters for result in self.records.values()]
         return next((each for each in counts if "networks" in each), counts[0])
 
@@ -305,7 +304,7 @@ class EntryResults(Shown):
 
     @property
     def hours(self) -> float:
-        """Core-hours spent on the seeds, those that were left out too."""
+        """Core-hours spent on the seeds, with the left-out ones."""
         return float(np.sum([result.hours for result in self.records.values()]))
 
     @property
@@ -406,7 +405,7 @@ class EntryResults(Shown):
 
     @property
     def metrics(self) -> dict[str, NDArray[np.float64]]:
-        """By name, what the environment measured along the curves, (N, T) each; NaN where it did not."""
+        """Metrics of the environment along the curves by name, (N, T) each; NaN where it measured none."""
         measured = [self.records[seed].measured for seed in self.seeds]
         nothing = np.full(self.epochs, np.nan)
         names = sorted({name for own in measured for name in own})

@@ -223,7 +223,7 @@ def unite(
 
 
 def _place(store: EntryStore, seed: int, write: Writer) -> None:
-    """Put a seed into its place, whole or not at all; what is there stays until the new one is whole."""
+    """Put a seed into its place, whole or not at all; an existing seed stays until the new one is whole."""
     place = store.seed(seed).path
     made, old = (place.with_name(f".{place.name}.{word}") for word in ("import", "old"))
     try:

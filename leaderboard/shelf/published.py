@@ -105,7 +105,7 @@ class PublishedEntry:
 
     @property
     def published(self) -> PublishedRecord:
-        """What the record says beside what was run."""
+        """The published part of the record."""
         assert self.record.published is not None
         return self.record.published
 

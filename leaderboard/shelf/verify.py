@@ -406,7 +406,7 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
 
 
 def _other_instructions(here: Provenance, there: Provenance) -> str | None:
-    """Say in what the instruction sets differ: those of the processors, unless both sides fixed them alike.
+    """Name the difference between instruction sets of processors, unless both sides fixed them alike.
 
     Older records have no `instructions`; nothing fixed them then.
     """

@@ -46,8 +46,8 @@ MEMORY = 2**30
 
 LANE_MULTIPLE = 64 if torch.backends.cpu.get_cpu_capability() == "AVX512" else 16
 """Every seed's lanes are padded to a multiple of this. torch multiplies complex numbers with fused operations in
-vectors and without them in what is left over at the end, so that a lane's bits would depend on its place. Vectors of
-AVX-512 are twice as long as those of AVX2, and what is left over there is more: with 32, some lanes differed."""
+vectors and without them in the rest at the end, so that a lane's bits would depend on its place. Vectors of AVX-512
+are twice as long as vectors of AVX2, and so is the rest: with 32, some lanes differed."""
 
 SIMULATORS = (
     "default.",
@@ -337,7 +337,7 @@ def _on_braket(options: PennyLaneOptions) -> bool:
 
 
 def braket_terms(device: Any, shots: int | None, circuits: int) -> str:
-    """Say how many tasks wait at an `AwsDevice`, and what a number of circuits costs there."""
+    """Return the number of tasks that wait at an `AwsDevice` and the price of a number of circuits, in words."""
     cost = device.properties.service.deviceCost
     waiting = ", ".join(
         f"{kind.value}: {count}" for kind, count in device.queue_depth().quantum_tasks.items()

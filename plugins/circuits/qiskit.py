@@ -274,7 +274,7 @@ def _gradient(options: QiskitOptions) -> str:
 
 
 def _check_device(options: QiskitOptions) -> None:
-    """Refuse what a device does not do, or only a device does."""
+    """Refuse options that a device does not have, or only a device has."""
     if options.device is None:
         if options.mitigation != "none":
             raise OptionError(

@@ -106,7 +106,7 @@ class CommandEngine:
         return requested or usable_cores()
 
     def queued(self, store: EntryStore) -> set[int]:
-        """Return nothing: what a queue holds is not known here, and does no harm when it begins."""
+        """Return no seeds: a queue's content is unknown here, and a late worker does no harm."""
         return set()
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:

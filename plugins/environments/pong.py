@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 500.0, 640.0
 BALL, PADDLE, PADDLE_WIDTH = 32.0, 70.0, 20.0
 """Side of the ball and height of a paddle. Paddles stand behind the field's edges, so their width is only drawn."""
 PADDLE_SPEED, BALL_SPEED, BALL_MOST, BALL_MORE = 8.0, 10.0, 13.0, 3.0
-"""Pixels a frame: of paddles; of the ball to the side; upward at most; what a moving paddle adds upward."""
+"""Pixels a frame: of paddles; of the ball to the side; upward at most; added upward by a moving paddle."""
 LOWEST, HIGHEST = -PADDLE / 2, HEIGHT - PADDLE / 2
 """Between these is the lower end of a paddle."""
 STEPS = np.array([0.0, 1.0, -1.0])

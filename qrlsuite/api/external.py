@@ -72,7 +72,7 @@ def import_curves(
     FileError
         If a file cannot be read, or something is no learning curve. Nothing is written then.
     OptionError
-        If an array has the wrong shape, or nothing says what a good score is.
+        If an array has the wrong shape, or no argument defines a good score.
 
     Examples
     --------

@@ -41,7 +41,7 @@ class Resources:
 
 
 def resources(circuit: Circuit) -> Resources:
-    """Count what a circuit takes."""
+    """Count a circuit's resources."""
     operations = circuit.operations
     return Resources(
         qubits=circuit.qubits,
@@ -74,7 +74,7 @@ LARGEST_RANK = 12
 
 
 def jacobian_rank(circuit: Circuit, seed: int = 0) -> int | None:
-    """Return how many directions of its parameters change what a circuit computes, to first order.
+    """Return how many directions of its parameters change a circuit's function, to first order.
 
     It is the rank of the Jacobian of all expectation values by all parameters, at random parameters as they are drawn
     initially and at more than enough random inputs of a standard normal distribution. The rest of the parameters are

@@ -226,7 +226,7 @@ def _unchosen(places: NDArray[np.int64], values: Array) -> ValueError:
 
 
 class _Records:
-    """Memory (n, rows, wide) of a pass, such as what a chunk of samples is in every layer; it then serves another."""
+    """Memory (n, rows, wide) of a pass, such as a chunk's values in every layer; it then serves another pass."""
 
     def __init__(self, purpose: str, number: int, rows: int, wide: int) -> None:
         self.key = purpose, rows, wide

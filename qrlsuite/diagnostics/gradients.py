@@ -54,7 +54,7 @@ def factor_per_qubit(qubits: Sequence[int], gradients: Sequence[Array], seed: in
     """Estimate by which factor the variance changes with each further qubit.
 
     It is 2 to the slope of a straight line through the base-2 logarithms of the variances, by least squares. A factor
-    below 1 at every size is what a barren plateau looks like; that a straight line fits is not tested.
+    below 1 at every size indicates a barren plateau; the fit of a straight line is not tested.
 
     Parameters
     ----------

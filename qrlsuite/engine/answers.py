@@ -1,7 +1,7 @@
 """Checks of a remote worker's answer: nothing in it is believed before it is written.
 
-A worker that is broken, out of date or somebody else's costs the group that it answers for, and no more: what is
-written can be read, ranked and continued like what was trained here.
+A worker that is broken, out of date or somebody else's costs the group that it answers for, and no more: written
+seeds can be read, ranked and continued like seeds that were trained here.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ training; a probe tests the real training. Both trainings go from nothing until 
 and must agree in every record and every number of the state, to the last bit. The built-in things are held by the
 suite's tests and are not probed.
 
-- The middle seed shows most: what a process keeps is the first seed's (a cache, a stack's plain attributes), or the
-  last one's (a class attribute).
+- The middle seed shows most: leaked state is the first seed's (a cache, a stack's plain attributes) or the last
+  seed's (a class attribute).
 - A group that begins is one side itself, and its middle seed, alone, the other. A group of one is the other side, and
   three seeds are trained in a fresh process. Of a group of two, or one that goes on from a checkpoint, both sides are
   trained in fresh processes.

@@ -69,7 +69,7 @@ class Record(pydantic.BaseModel):
     Attributes
     ----------
     what, cure:
-        For messages: what the whole file is, and what to do where it is damaged.
+        For messages: the kind of file, and the remedy for a damaged one.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, populate_by_name=True)
@@ -191,7 +191,7 @@ class DeviceRecord(Record):
 
 
 class Provenance(Record):
-    """With what a seed was trained, see `qrlsuite.results.provenance`; never part of an identity.
+    """Versions and machine that trained a seed, see `qrlsuite.results.provenance`; never part of an identity.
 
     Attributes
     ----------
@@ -229,7 +229,7 @@ class Provenance(Record):
 
     @property
     def with_earlier(self) -> list[Provenance]:
-        """The record of a published seed's last epochs, and those of earlier ones that were made otherwise."""
+        """The record of a published seed's last epochs, and records of earlier epochs that were made otherwise."""
         return [self, *self.before]
 
 
@@ -368,7 +368,7 @@ class EntryRecord(CodedRecord):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Refuse hashes and a name that do not stand for what was run."""
+        """Refuse hashes and a name that do not follow from the entry."""
         identity = self.identity
         if digest(identity.task) != self.task_hash:
             raise ValueError("the task's definition does not have its hash")
@@ -447,7 +447,7 @@ class EntryRecord(CodedRecord):
 
 
 class RunRecord(CodedRecord):
-    """One seed's run: what is trained, how far it is, and with what it was made.
+    """One seed's run: its entry, progress and provenance.
 
     Attributes
     ----------
@@ -494,7 +494,7 @@ class RunRecord(CodedRecord):
 
     @property
     def begun(self) -> dict[str, Any]:
-        """What stays when the run goes on: the code that began it, and what a probe found."""
+        """Facts that stay when the run goes on: the code that began it, and the result of a probe."""
         return {name: self.content[name] for name in ("code", "probe") if name in self.content}
 
     def told(self, folder: Path, **more: Any) -> dict[str, Any]:

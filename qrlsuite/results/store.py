@@ -1,6 +1,6 @@
 """Results on disk: the single source of truth, readable without this suite.
 
-    runs/<task>/<entry>/entry.json              what was run: every option resolved
+    runs/<task>/<entry>/entry.json              the entry with every option resolved
                         seed-0007/run.json      status, parameters, code identity, versions, machine
                                   epochs.jsonl  one line per epoch while the run goes on
                                   epochs.parquet  all epochs once the run has finished
@@ -376,7 +376,7 @@ class SeedStore:
         return rows
 
     def newest_epoch(self) -> int:
-        """Return the epoch of the newest line of a run that goes on; that of its record where there is none."""
+        """Return the epoch of the newest line of a run that goes on, or the epoch in its record without lines."""
         lines = read_lines(self.lines)
         return EpochLine.read(lines[-1], self.lines).epoch if lines else self.trained_epochs()
 

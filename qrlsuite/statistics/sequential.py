@@ -144,7 +144,7 @@ def _stopped(
     increment: float,
     bound: float,
 ) -> float:
-    """Return the probability that a study stops at this look at a bound on |Z|, minus what it may spend."""
+    """Return the probability that a study stops at this look at a bound on |Z|, minus the error it may spend."""
     from scipy.special import ndtr
 
     beyond = ndtr((points - bound * scale) / step)

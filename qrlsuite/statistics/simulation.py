@@ -1,4 +1,4 @@
-"""Simulated runs that resemble an entry's: what a comparison or a design would find, and how often.
+"""Simulated runs that resemble an entry's, to compute how often a comparison or a design finds a difference.
 
 `SmoothedRuns` draws independent runs from a smoothed model of an entry's curves, at any number of runs. `judge_times`
 returns the findings of rule `times` in many pairs, and `decision_rates` plays whole sequential designs. Error rates of
@@ -27,8 +27,8 @@ class SmoothedRuns:
 
     A drawn run is V = mean + (V_i - mean + h Z) / sqrt(1 + h^2), with i one of the entry's N runs at random
     and Z a Gaussian curve with the entry's covariance between epochs, drawn as a random combination of the
-    centered runs. Jitter is thus as smooth in time as the runs themselves, and mean and covariance stay
-    what they were (Silverman and Young 1987: shrunken smoothed bootstrap). Clipped to `bounds`.
+    centered runs. Jitter is thus as smooth in time as the runs themselves, and mean and covariance do not
+    change (Silverman and Young 1987: shrunken smoothed bootstrap). Clipped to `bounds`.
 
     Without jitter (h = 0) draws repeat the N runs, and tie far more often than new runs would. The Gaussian
     part fills gaps between distinct groups of runs (some learn, some do not) as h grows.

@@ -328,7 +328,7 @@ def reason_note(study: StudyWithLooks) -> str:
 
 
 def horizon_note(outcome: StudyOutcome) -> str:
-    """Say what a verdict at the horizon means; empty where there is none."""
+    """Explain a verdict at the horizon; empty without such a verdict."""
     if not any(map(outcome.late, outcome.pairs)):
         return ""
     return (

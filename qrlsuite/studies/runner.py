@@ -391,7 +391,7 @@ class Session:
 
 
 def take_looks(study: StudyWithLooks, session: Session) -> StudyOutcome:
-    """Train what each look needs and take it, until every pair is closed, or others have the seeds it needs.
+    """Train the seeds of each look and take it, until every pair is closed, or others have the seeds.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Studies as data: one TOML file names the entries of an experiment, the pictures of it, and what a paper reports.
+"""Studies as data: one TOML file names the entries of an experiment, its pictures, and a paper's results.
 
 A study has no training of its own: `qrlsuite run` would train its entries in the same folders, so that several
 studies share the seeds of an entry. A study with a table `[looks]` compares its entries with as

@@ -232,8 +232,8 @@ def _end(lanes: Lanes) -> int:
 def _final(
     infos: Mapping[str, Any], done: NDArray[np.bool_], after: NDArray[Any], last: NDArray[Any], step: int
 ) -> None:
-    """Require that infos hold the last observation; `after` is what the step returned, `last` what it did in lanes
-    without autoreset.
+    """Require that infos hold the last observation; `after` is the step's result, `last` the result in lanes without
+    autoreset.
     """
     for key in ("final_obs", "_final_obs"):
         require(

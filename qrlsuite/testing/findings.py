@@ -45,7 +45,7 @@ _watcher: ContextVar[Callable[[str], None]] = ContextVar("_watcher", default=lam
 
 @contextlib.contextmanager
 def watching(call: Callable[[str], None]) -> Iterator[None]:
-    """Have `call(rule)` called before every rule that is checked: what a progress display needs."""
+    """Have `call(rule)` called before every rule that is checked, for a progress display."""
     token = _watcher.set(call)
     try:
         yield

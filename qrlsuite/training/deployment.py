@@ -41,7 +41,7 @@ from qrlsuite.training.evaluation import (
 from qrlsuite.training.trainer import Policy, Trainer, first_network
 
 LANES = 10
-"""Episodes of every agent in a round: what a device that stops half-way can lose."""
+"""Episodes of every agent in a round: the most that a device that stops half-way can lose."""
 
 
 def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:

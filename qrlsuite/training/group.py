@@ -165,7 +165,7 @@ class GroupFiles:
                 folder.write_record(record.changed(provenance=_with_origin(record, origin)))
 
     def add_probe(self, probe: ProbeRecord) -> None:
-        """Note in `run.json` of every seed what a probe found."""
+        """Note a probe's result in `run.json` of every seed."""
         for seed in self.seeds:
             folder = self.store.seed(seed)
             if (record := folder.record()) is not None:

@@ -23,8 +23,8 @@ Of an answer:
     lines, timings  of every new epoch: a line of `epochs.jsonl` for each seed; the line of `timings.jsonl`
     provenance      host, processor and versions
     parameters      their numbers, see `ModelBuilder.trained`
-    warnings        what the user should know
-    error           why the training cannot go on; None where it can. What was finished before stays in the answer
+    warnings        for the user
+    error           why the training cannot go on; None where it can. Finished epochs stay in the answer
     refused         why this worker does not take the task; None where it did. There is then nothing else
 
 At the last epoch the answer also holds the trained agents, as arrays whose names begin with `policy.`.
@@ -57,7 +57,7 @@ from qrlsuite.results.records import EntryRecord
 
 POLICY = "policy."
 MOST_BYTES = 32 << 20
-"""The largest task or answer: what a queue's connections and memory take without trouble."""
+"""The largest task or answer, which a queue's connections and memory take without trouble."""
 
 _one_at_a_time = threading.Lock()
 """Locked while training: torch's number of threads and a worker's memory are meant for one group."""

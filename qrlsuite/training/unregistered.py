@@ -139,7 +139,7 @@ def require_none(
 def _require_outputs(
     result: Any, given: tuple[int, int], wanted: tuple[int, int], module: nn.Module, model: str
 ) -> None:
-    """Refuse what a fresh network returns for inputs between 0 and 1 where no task can use it."""
+    """Refuse outputs of a fresh network for inputs between 0 and 1 that no task can use."""
     if not isinstance(result, Tensor):
         what = type(result).__name__
     elif tuple(result.shape) != wanted:

@@ -297,7 +297,7 @@ class Search(Shown):
 
     @property
     def beside(self) -> int:
-        """How many settings can be trained side by side in one population, at most: what a run costs depends on it."""
+        """How many settings can be trained side by side in one population, at most; the cost of a run depends on it."""
         return self.planned if self._per_agent else 1
 
     @property

@@ -43,7 +43,8 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     ## Observation Space
 
-    `Box(0, 1, (3 * stack,), float32)`, what was served last; the oldest of `stack` observations comes first.
+    `Box(0, 1, (3 * stack,), float32)`, the last antenna, intensity and beam; the oldest of `stack` observations
+    comes first.
 
     | Num | Observation                                   | Min | Max | Unit                          |
     |-----|-----------------------------------------------|-----|-----|-------------------------------|

@@ -150,8 +150,8 @@ def sample(
     """Draw valid support points, `counts[g]` trajectories from stream g: (sum of counts, points, 2).
 
     Each stream yields blocks of candidates, 6 and 2, 4, 8, ... for every trajectory that it still lacks,
-    and the valid ones are taken in order; so what a stream yields depends on nothing but the stream and its
-    count. x: uniform in [0, 6], the first forced to 0, the last to 6, sorted. y: uniform in [0, 6].
+    and the valid ones are taken in order; so a stream's candidates depend on the stream and its count alone.
+    x: uniform in [0, 6], the first forced to 0, the last to 6, sorted. y: uniform in [0, 6].
     """
     accepted: list[list[FloatArray]] = [[] for _ in streams]
     missing = list(counts)

@@ -58,7 +58,7 @@ def optimize(
     Parameters
     ----------
     hamiltonians, which:
-        (K, d, d) real symmetric matrices, and which of them each lane has, (L,).
+        (K, d, d) real symmetric matrices, and each lane's index among them, (L,).
     gates, angles:
         (L, steps); angles are changed in place.
     counts:

@@ -22,7 +22,7 @@ the 100 published, width 64 was told apart from width 16 and from 6 qubits (Holm
 
 
 def demo(runs: RunsOption = Path("runs")) -> None:
-    """Train two networks and a circuit on beam6g, rank them beside the published entries, and say what was found.
+    """Train two networks and a circuit on beam6g, rank them beside the published entries, and print the result.
 
     It takes about two minutes, and prints each command before it runs it. Stop with Ctrl-C at any time; the same
     command continues.

@@ -1,4 +1,4 @@
-"""`qrlsuite doctor`: test the installation, and print what a bug report needs."""
+"""`qrlsuite doctor`: test the installation, and print the facts for a bug report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from qrlsuite.installation import diagnose
 
 
 def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> None:
-    """Test the installation, the plugins and the results folder, and print what a bug report needs.
+    """Test the installation, the plugins and the results folder, and print the facts for a bug report.
 
     Imports every package that is needed and computes a circuit, which takes some seconds. Nothing is changed.
 

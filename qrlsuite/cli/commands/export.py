@@ -49,7 +49,7 @@ def export(
 ) -> None:
     """Write entries for a leaderboard: curves and trained agents of every seed, and how they were made.
 
-    Only finished seeds are written. `qrlsuite verify` checks what was written, and can train some seeds again. A study
+    Only finished seeds are written. `qrlsuite verify` checks the files, and can train some seeds again. A study
     is written as its entries; one with looks with the curves of its seeds, so that others can compute its verdicts
     (`qrlsuite show DIR/NAME`) and go on with it (`qrlsuite import DIR/NAME`); it may be written again while it goes on.
 

@@ -43,7 +43,7 @@ def import_entries(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only what is missing.
+    """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only missing seeds.
 
     From a results folder, agents and checkpoints are copied too, from an export the agents that it has. A seed
     that is here already stays, unless it has more epochs there. Stop with Ctrl-C at any time; the same command

@@ -91,7 +91,7 @@ def leaderboard(
     more at none: permutation tests, with Holm's correction over all pairs of the board, so that --alpha is the
     probability of any false difference. An entry's rank is 1 + the number of entries that outperform it; a range says
     which ranks the decided pairs leave. The order is by steps below threshold. Entries with fewer than 20 seeds are
-    not ranked. --entry chooses what is shown, and changes no rank.
+    not ranked. --entry hides other rows, and changes no rank.
 
     --rule paper ranks by the paper's definition instead: tiers of significant outperformance in the cells of the
     task's grid, by intervals of the sample complexity.

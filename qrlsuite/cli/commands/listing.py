@@ -31,9 +31,9 @@ def list_things(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List what is registered, by the suite or by plugins, and from which distribution.
+    """List the things that the suite and plugins register, with their distribution.
 
-    `plugins` shows each plugin with its version, what it registers and its problems.
+    `plugins` shows each plugin with its version, its things and its problems.
 
     Examples: qrlsuite list models; qrlsuite list plugins
     """

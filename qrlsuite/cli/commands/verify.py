@@ -45,14 +45,14 @@ def verify(
     """Check published entries and studies, and train some of their seeds again.
 
     Files: hashes, names and labels are computed again; every seed must have every epoch, and scores in range.
-    With --rerun, seeds of each entry are drawn after its files are read, and trained from nothing; what that costs is
-    said first. An entry is `verified` if all curves come out bit for bit. A curve that differs is a failure on the same
+    With --rerun, seeds of each entry are drawn after its files are read, and trained from nothing; the cost is printed
+    first. An entry is `verified` if all curves come out bit for bit. A curve that differs is a failure on the same
     type of machine with the same versions. Elsewhere an entry can be `plausible`: every seed begins as published, and
     its steps below the thresholds fit; the report says how likely forgeries would have been found. Parameters and
     circuit executions are counted again. Reports of one digest belong together: one failure among them stands. Exit
     code 1 if an entry fails.
 
-    With --base REV, what is checked are the entries and studies of the repository around this folder, below
+    With --base REV, the command checks the entries and studies of the repository around this folder, below
     leaderboard/, that differ from a commit or are not committed; a file with a name that no published file has is
     refused.
 
