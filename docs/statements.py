@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from qrlsuite import api
 from qrlsuite.leaderboard.boards.ranked import ranking_of
-from qrlsuite.leaderboard.boards.times import percent
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
+from qrlsuite.results.text import percent
 from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoard, Verdict, times_board
 from qrlsuite.statistics.estimator import sample_complexity
 from qrlsuite.statistics.times import times_below

@@ -24,7 +24,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published_studies import PublishedStudy
-from qrlsuite.results.text import hours_text, steps_text
+from qrlsuite.results.text import hours_text, interval_text, mean_text, steps_text
 from qrlsuite.studies.outcome import StudyOutcome, by_question, difference_text, versus
 from qrlsuite.studies.together import StudiesTogether
 from qrlsuite.training.trainer import count_parameters
@@ -82,8 +82,7 @@ def entries(outcome: StudyOutcome) -> Rows:
     yield "entry", "seeds", "steps below threshold (95%)", "core-hours", "circuits per seed"
     for entry in outcome.as_dict()["entries"]:
         if entry["mean_time"] is not None:
-            low, high = map(steps_text, entry["mean_time_interval"])
-            took = f"{steps_text(entry['mean_time'])} ({low} to {high})"
+            took = interval_text(mean_text, entry["mean_time"], *entry["mean_time_interval"])
             executed = outcome.study.executions(entry["name"])
             circuits = f"{executed / 1e6:.1f} million" if executed else ""
             yield (
@@ -100,8 +99,8 @@ def together(names: str) -> Rows:
     read = StudiesTogether(tuple(map(published, names.split("+"))))
     for place, sheet in enumerate(part for part in read.parts() if isinstance(part, Sheet)):
         if not place:
-            yield [column.head for column in sheet.columns]
-        yield from sheet.rows
+            yield [column.title for column in sheet.columns]
+        yield from sheet.cells
 
 
 def means(names: str) -> Rows:
@@ -122,14 +121,14 @@ OF_SEVERAL: dict[str, Callable[[str], Rows]] = {"together": together, "means": m
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:
     """Some columns of a sheet, in this order."""
     yield heads
-    columns = {column.head: column.cells for column in sheet.columns}
+    columns = {column.title: cells for column, cells in zip(sheet.columns, zip(*sheet.cells))}
     yield from zip(*(columns[head] for head in heads))
 
 
 def board(task: str) -> Rows:
     """The board as `qrlsuite leaderboard` prints it."""
     [sheet] = api.board(task, published=True, runs="none").sheets()
-    heads = [column.head for column in sheet.columns if column.head not in ("core-hours", "settings")]
+    heads = [column.title for column in sheet.columns if column.title not in ("core-hours", "settings")]
     return _chosen(sheet, heads)
 
 
@@ -207,7 +206,7 @@ def executions(task: str) -> Rows:
     """The entries that execute circuits, by what these cost."""
     [section] = api.board(task, by="executions", published=True, runs="none").sections
     kept = replace(section, rows=tuple(row for row in section.rows if not row.price.problem))
-    return _chosen(kept.sheet(), kept.columns()[:5])
+    return _chosen(kept.sheet(), [column.title for column in kept.columns() if column.shown][:5])
 
 
 def changes(task: str) -> Rows:

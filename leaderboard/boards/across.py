@@ -18,7 +18,9 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard.boards import costs
+from qrlsuite.leaderboard.boards.columns import names_text
 from qrlsuite.leaderboard.boards.ranked import learning_curves, of_one_definition, ranking_of
+from qrlsuite.leaderboard.boards.scores import means
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import counted, steps_text
@@ -31,6 +33,7 @@ from qrlsuite.statistics import (
     rliable_arrays,
 )
 from qrlsuite.statistics.grid import FloatArray
+from qrlsuite.table import Column, flat, record
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,40 +89,45 @@ class AcrossSection:
         """Indices in `results` by mean, least first."""
         return self.results.order
 
-    def columns(self) -> tuple[str, ...]:
-        """Return the heads of the table that `cells` fills."""
-        level = f"{100 * (1 - self.alpha):g}%"
+    def columns(self) -> tuple[Column[int], ...]:
+        """Return the columns; a row is a place of the order."""
+        order, results = self.order, self.results
+
+        def name(place: int) -> str:
+            return results.names[order[place]]
+
+        def seeds(place: int) -> list[int]:
+            return [len(each) for each in self.shares.values[name(place)]]
+
+        def less(place: int) -> float | None:
+            pair = order[place : place + 2]
+            return float(results.improvement[pair]) if len(pair) > 1 else None
+
         return (
-            "entry",
-            "seeds",
-            f"mean ({level})",
-            f"IQM ({level})",
-            "P(less than next)",
-            "needs less than",
-            "needs more than",
+            Column("label", name, str, head="entry", words=True, flat=("entry",)),
+            Column("seeds", seeds, lambda counts: ", ".join(map(str, counts))),
+            *means(results, order, f"{100 * (1 - self.alpha):g}%"),
+            Column("", less, "{:.2f}".format, head="P(less than next)"),
+            Column(
+                "",
+                lambda place: self._against(order[place], 1),
+                names_text,
+                head="needs less than",
+                words=True,
+            ),
+            Column(
+                "",
+                lambda place: self._against(order[place], -1),
+                names_text,
+                head="needs more than",
+                words=True,
+            ),
         )
 
     def sheet(self, explain: bool = False) -> Sheet:
         """Return the comparison as a table; `explain` adds all its notes."""
-        rows = [self.cells(place) for place in range(len(self.order))]
-        words = ("entry", "needs less than", "needs more than")
-        return Sheet.of(
-            self.title, self.columns(), rows, self.notes(), words, "across", explain, "Across tasks"
-        )
-
-    def cells(self, place: int) -> tuple[str, ...]:
-        """Return the row at a place of the order as text."""
-        index, results = self.order[place], self.results
-        after = self.order[place + 1] if place + 1 < len(self.order) else None
-        return (
-            results.names[index],
-            ", ".join(str(len(each)) for each in self.shares.values[results.names[index]]),
-            _interval(results.mean[index], results.mean_interval[index]),
-            _interval(results.interquartile_mean[index], results.interquartile_interval[index]),
-            "-" if after is None else f"{results.improvement[index, after]:.2f}",
-            ", ".join(self._against(index, 1)) or "-",
-            ", ".join(self._against(index, -1)) or "-",
-        )
+        rows, notes = range(len(self.order)), tuple(self.notes())
+        return Sheet(self.title, self.columns(), rows, notes, explain, label="across", name="Across tasks")
 
     def notes(self) -> list[str]:
         """Explain the columns."""
@@ -140,17 +148,7 @@ class AcrossSection:
                 for task, horizon in zip(self.shares.tasks, self.shares.horizons)
             ],
             "alpha": self.alpha,
-            "entries": [
-                {
-                    "label": results.names[index],
-                    "seeds": [len(each) for each in self.shares.values[results.names[index]]],
-                    "mean": float(results.mean[index]),
-                    "mean_interval": results.mean_interval[index].tolist(),
-                    "interquartile_mean": float(results.interquartile_mean[index]),
-                    "interquartile_interval": results.interquartile_interval[index].tolist(),
-                }
-                for index in order
-            ],
+            "entries": [record(self.columns(), place) for place in range(len(order))],
             "improvement": results.improvement[np.ix_(order, order)].tolist(),
             "adjusted_p": [
                 [None if math.isnan(p) else float(p) for p in row]
@@ -161,34 +159,25 @@ class AcrossSection:
 
     def flat(self) -> list[dict[str, object]]:
         """Return one row of columns per entry, for a spreadsheet."""
-        rows: list[dict[str, object]] = []
-        for index in self.order:
-            name, results = self.results.names[index], self.results
+        results = self.results
+
+        def beside(index: int) -> dict[str, object]:
             others = [other for other in self.order if other != index]
-            rows.append(
-                {
-                    "entry": name,
-                    "tasks": list(self.shares.tasks),
-                    "horizons": [str(horizon) for horizon in self.shares.horizons],
-                    "seeds": [str(len(each)) for each in self.shares.values[name]],
-                    "mean": float(results.mean[index]),
-                    "mean_low": float(results.mean_interval[index, 0]),
-                    "mean_high": float(results.mean_interval[index, 1]),
-                    "iqm": float(results.interquartile_mean[index]),
-                    "iqm_low": float(results.interquartile_interval[index, 0]),
-                    "iqm_high": float(results.interquartile_interval[index, 1]),
-                    "improvement": [
-                        f"{results.names[other]}: {results.improvement[index, other]:.4g}" for other in others
-                    ],
-                    "adjusted_p": [
-                        f"{results.names[other]}: {results.adjusted[index, other]:.6g}" for other in others
-                    ],
-                    "needs_less_than": self._against(index, 1),
-                    "needs_more_than": self._against(index, -1),
-                    "alpha": self.alpha,
-                }
-            )
-        return rows
+            return {
+                "tasks": list(self.shares.tasks),
+                "horizons": [str(horizon) for horizon in self.shares.horizons],
+                "improvement": [f"{results.names[j]}: {results.improvement[index, j]:.4g}" for j in others],
+                "adjusted_p": [f"{results.names[j]}: {results.adjusted[index, j]:.6g}" for j in others],
+                "needs_less_than": self._against(index, 1),
+                "needs_more_than": self._against(index, -1),
+                "alpha": self.alpha,
+            }
+
+        rows = [{**flat(self.columns(), place), **beside(index)} for place, index in enumerate(self.order)]
+        short = {f"interquartile_{end}": f"iqm_{end}" for end in ("low", "high")} | {
+            "interquartile_mean": "iqm"
+        }
+        return [{short.get(name, name): value for name, value in row.items()} for row in rows]
 
     def _against(self, index: int, sign: int) -> list[str]:
         return [
@@ -359,7 +348,3 @@ def configuration(entry: EntryResults) -> str:
     names = ("algorithm", "algorithm_options", "model", "model_options")
     parts = {name: entry.identity.get(name) for name in names}
     return digest({**parts, "algorithm": entry.algorithm, "model": entry.model})
-
-
-def _interval(value: float, ends: FloatArray) -> str:
-    return f"{value:.3f} ({ends[0]:.3f} to {ends[1]:.3f})"

@@ -16,16 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.engine.sheet import Sheet, flat_row
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import listed
 from qrlsuite.leaderboard.boards import tables
+from qrlsuite.leaderboard.boards.columns import estimate, names_text, ranks_text
 from qrlsuite.leaderboard.boards.ranked import Complexity, complexity_at, ranking_of
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.text import hours_text, steps_text
+from qrlsuite.results.text import hours_text, interval_text, mean_text
 from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
 from qrlsuite.statistics.compare import TOO_FEW
+from qrlsuite.table import Column, flat, record
 
 CELLS = 1000
 """Parts of the budget at which curves are read where the epochs of entries cost differently."""
@@ -53,21 +55,17 @@ class Unit:
     meaning: str
 
 
-def _count(number: float) -> str:
-    return steps_text(number, digits=3)
-
-
 UNITS = {
     unit.name: unit
     for unit in (
         Unit(
             "executions",
-            _count,
-            _count,
+            mean_text,
+            mean_text,
             "executions: circuits of training, gradients and validation, each with all its shots; where a simulator "
             "differentiates exactly, as many as the parameter-shift rule would execute on hardware",
         ),
-        Unit("shots", _count, _count, "shots: circuit executions times the shots of each"),
+        Unit("shots", mean_text, mean_text, "shots: circuit executions times the shots of each"),
         Unit(
             "core-hours",
             hours_text,
@@ -160,6 +158,12 @@ class CostRow:
     complexity: Complexity
     index: int | None
 
+    @property
+    def shots(self) -> int | None:
+        """Shots of each circuit execution; None where it computes exactly, or has no circuit."""
+        shots: int | None = self.entry.options.get("model", {}).get("shots")
+        return shots
+
 
 @dataclass(frozen=True, eq=False)
 class CostSection:
@@ -202,34 +206,67 @@ class CostSection:
         """The level of every interval: `95%`."""
         return f"{100 * (1 - self.alpha):g}%"
 
-    def columns(self) -> tuple[str, ...]:
-        """Return the heads of the table that `cells` fills."""
-        spent = f"{self.unit.name} {self.before} threshold ({self.level})"
-        names = ("rank", "entry", spent, "per step", "sample complexity (5%-95%)", "at cap", "shots", "seeds")
-        return (*names, "needs less than", "needs more than")
+    def columns(self) -> list[Column[CostRow]]:
+        """Return the columns, costs in the unit."""
+
+        def spent(row: CostRow) -> list[float] | None:
+            mean = self.mean(row)
+            return None if mean is None else [each * self.part for each in (mean.mean, *mean.interval)]
+
+        def complexity(row: CostRow) -> list[float] | None:
+            found = row.complexity
+            steps = (found.steps, found.low, found.high)
+            return [each * row.price.per_step for each in steps] if self.priced(row) else None
+
+        def complexity_text(row: CostRow) -> str:
+            if (costs := complexity(row)) is None:
+                return "-"
+            begin = "~" * self.marked(row) + ">= " * row.complexity.unsettled
+            return f"{begin}{interval_text(text, *costs)[:-1]}{', at cap' * row.complexity.at_cap})"
+
+        def per_step(row: CostRow) -> str:
+            return (
+                "~" * self.marked(row) + self.unit.step_text(row.price.per_step) if self.priced(row) else "-"
+            )
+
+        def at_cap(row: CostRow) -> float | None:
+            return None if (mean := self.mean(row)) is None else float(mean.at_cap.mean())
+
+        def shots(row: CostRow) -> str:
+            return f"{row.shots:,}" if row.shots else "exact" if row.entry.has_circuit else "-"
+
+        text, head = self.unit.text, f"{self.unit.name} {self.before} threshold ({self.level})"
+        complexity_head = "sample complexity (5%-95%)"
+        return [
+            Column(
+                "ranks",
+                lambda row: None if (ranks := self.ranks(row)) is None else list(ranks),
+                head="rank",
+                cell=self.rank_text,
+            ),
+            Column("entry", lambda row: row.entry.name, cell=lambda row: row.entry.label, words=True),
+            Column("label", lambda row: row.entry.label),
+            *estimate("mean_cost", "mean_cost_interval", spent, text, head=head),
+            Column("per_step", lambda row: row.price.per_step if self.priced(row) else None, cell=per_step),
+            *estimate(
+                "sample_complexity", "interval", complexity, text, head=complexity_head, cell=complexity_text
+            ),
+            Column("at_cap", lambda row: row.complexity.at_cap),
+            Column("unsettled", lambda row: row.complexity.unsettled),
+            Column("mean_at_cap", at_cap, "{:.0%}".format, head="at cap"),
+            Column("shots", lambda row: row.shots, cell=shots),
+            Column("seeds", lambda row: len(row.entry.seeds), str),
+            Column("needs_less_than", lambda row: self.against(row, Direction.FEWER), names_text, words=True),
+            Column("needs_more_than", lambda row: self.against(row, Direction.MORE), names_text, words=True),
+            Column("comparable", lambda row: not row.price.problem),
+            Column("problem", lambda row: row.price.problem or None),
+        ]
 
     def sheet(self, explain: bool = False) -> Sheet:
         """Return the section as a table; `explain` adds all its notes."""
-        rows = [self.cells(row) for row in self.rows]
-        words = ("entry", "needs less than", "needs more than")
         label, name = f"{self.task}-{self.unit.name}", f"{self.task} by {self.unit.name}"
-        return Sheet.of(self.title, self.columns(), rows, self.notes(), words, label, explain, name)
-
-    def cells(self, row: CostRow) -> tuple[str, ...]:
-        """Return a row as text."""
-        mean = self.mean(row)
-        shots = row.entry.options.get("model", {}).get("shots")
-        return (
-            self.rank_text(row),
-            row.entry.label,
-            "-" if mean is None else self._mean_text(mean),
-            ("~" * self.marked(row)) + self.unit.step_text(row.price.per_step) if self.priced(row) else "-",
-            ("~" * self.marked(row)) + self._complexity_text(row) if self.priced(row) else "-",
-            "-" if mean is None else f"{mean.at_cap.mean():.0%}",
-            f"{shots:,}" if shots else "exact" if row.entry.has_circuit else "-",
-            f"{len(row.entry.seeds)}",
-            ", ".join(self.against(row, Direction.FEWER)) or "-",
-            ", ".join(self.against(row, Direction.MORE)) or "-",
+        return Sheet(
+            self.title, tuple(self.columns()), self.rows, tuple(self.notes()), explain, label=label, name=name
         )
 
     def priced(self, row: CostRow) -> bool:
@@ -252,7 +289,7 @@ class CostSection:
         ranks = self.ranks(row)
         if ranks is None:
             return "-" if row.index is None else "undecided"
-        return str(ranks[0]) if ranks[0] == ranks[1] else f"{ranks[0]}-{ranks[1]}"
+        return ranks_text(ranks)
 
     def mean(self, row: CostRow) -> MeanTime | None:
         """Return the mean cost below threshold, in parts of the budget; None where the entry is not compared."""
@@ -268,17 +305,6 @@ class CostSection:
             for other in self.rows
             if other.index is not None and other is not row and directions[other.index] is direction
         ]
-
-    def _mean_text(self, mean: MeanTime) -> str:
-        point, low, high = (self.unit.text(value * self.part) for value in (mean.mean, *mean.interval))
-        return f"{point} ({low} to {high})"
-
-    def _complexity_text(self, row: CostRow) -> str:
-        found = row.complexity
-        point, low, high = (
-            self.unit.text(steps * row.price.per_step) for steps in (found.steps, found.low, found.high)
-        )
-        return f"{'>= ' * found.unsettled}{point} ({low} to {high}{', at cap' * found.at_cap})"
 
     def notes(self) -> list[str]:
         """Explain the columns, and the marks that occur."""
@@ -304,9 +330,7 @@ class CostSection:
             lines.append(f"curves are read at {CELLS} equal parts of the budget")
         if any(self.marked(row) for row in self.rows):
             lines.append("~ : not to be compared with the others")
-        shots = {
-            row.entry.options.get("model", {}).get("shots") for row in self.rows if row.index is not None
-        }
+        shots = {row.shots for row in self.rows if row.index is not None}
         if self.unit.name == "executions" and len(shots) > 1:
             lines.append("executions of different shots count alike here; --by shots counts shots")
         uneven = [row for row in self.rows if UNEVEN < row.price.spread < math.inf]
@@ -329,7 +353,7 @@ class CostSection:
             "budget": self.budget if self.compared is not None else None,
             "alpha": self.alpha,
             "cell": self.cell,
-            "rows": [self.row_dict(row) for row in self.rows],
+            "rows": [record(self.columns(), row) for row in self.rows],
             "notes": self.notes(),
         }
 
@@ -337,31 +361,7 @@ class CostSection:
         """Return one row of values per entry, for a spreadsheet."""
         budget = self.budget if self.compared is not None else None
         facts = {"by": self.unit.name, "budget": budget}
-        return [flat_row({"task": self.task}, self.row_dict(row), facts) for row in self.rows]
-
-    def row_dict(self, row: CostRow) -> dict[str, Any]:
-        """Return one entry's plain values, costs in the unit."""
-        mean, ranks, cost = self.mean(row), self.ranks(row), row.price.per_step
-        known = self.priced(row)
-        return {
-            "entry": row.entry.name,
-            "label": row.entry.label,
-            "ranks": None if ranks is None else list(ranks),
-            "seeds": len(row.entry.seeds),
-            "shots": row.entry.options.get("model", {}).get("shots"),
-            "per_step": cost if known else None,
-            "comparable": not row.price.problem,
-            "problem": row.price.problem or None,
-            "sample_complexity": row.complexity.steps * cost if known else None,
-            "interval": [row.complexity.low * cost, row.complexity.high * cost] if known else None,
-            "at_cap": row.complexity.at_cap,
-            "unsettled": row.complexity.unsettled,
-            "mean_cost": None if mean is None else mean.mean * self.part,
-            "mean_cost_interval": None if mean is None else [end * self.part for end in mean.interval],
-            "mean_at_cap": None if mean is None else float(mean.at_cap.mean()),
-            "needs_less_than": self.against(row, Direction.FEWER),
-            "needs_more_than": self.against(row, Direction.MORE),
-        }
+        return [{"task": self.task, **flat(self.columns(), row), **facts} for row in self.rows]
 
 
 def sections(

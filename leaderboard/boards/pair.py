@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.leaderboard.boards.ranked import ranking_of
-from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow, percent
+from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.text import counted, steps_text
+from qrlsuite.results.text import counted, interval_text, mean_text, p_text, percent, share_text, steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
     Direction,
@@ -57,7 +57,7 @@ class OnBoard:
         verdict = "told apart, too" if self.direction in _DECIDED else str(self.direction)
         return (
             f"on the board of {self.n_entries} entries, which is stricter ({pairs} pairs): {verdict}, "
-            f"adjusted {p_text(self.adjusted)}"
+            f"adjusted {said(self.adjusted)}"
         )
 
 
@@ -134,8 +134,8 @@ class PairVerdict:
         mean = fewer(self.times.difference, first_wins)
         if mean[1] > 0:
             return (
-                f"{winner} needs {share(mean[0])} fewer steps than {loser} ({share(mean[1])} to "
-                f"{share(mean[2])}, {self._seeds}, {self._p})"
+                f"{winner} needs {share_text(mean[0])} fewer steps than {loser} ({share_text(mean[1])} to "
+                f"{share_text(mean[2])}, {self._seeds}, {self._p})"
             )
         if math.isnan(mean[1]):
             return f"{winner} needs fewer steps than {loser} ({self._seeds}, {self._p})"
@@ -161,7 +161,7 @@ class PairVerdict:
 
     @property
     def _p(self) -> str:
-        return "adjusted " * self.adjusted + p_text(self.times.p)
+        return "adjusted " * self.adjusted + said(self.times.p)
 
     def _at(self, sign: int) -> str:
         """Name the thresholds at which the first (1) or the second (-1) needs significantly fewer steps, and its share.
@@ -173,7 +173,11 @@ class PairVerdict:
         texts = []
         for place in places:
             value, low, high = fewer(self.times.differences[place], sign > 0)
-            size = "" if math.isnan(low) else f" ({share(value)} fewer, {share(low)} to {share(high)})"
+            size = (
+                ""
+                if math.isnan(low)
+                else f" ({share_text(value)} fewer, {share_text(low)} to {share_text(high)})"
+            )
             texts.append(f"{self.thresholds[place]}{size}")
         return f"{'threshold' if len(texts) == 1 else 'thresholds'} {', '.join(texts)}"
 
@@ -190,7 +194,7 @@ class PairVerdict:
                 threshold,
                 *(_steps(pair, side, place) for side in (0, 1)),
                 _difference(pair.differences[place]),
-                p_text(float(pair.p_each[place])).removeprefix("p ").removeprefix("= ") or "-",
+                p_text(float(pair.p_each[place])) or "-",
                 self._verdict(place),
             )
             for place, threshold in enumerate(self.thresholds)
@@ -221,7 +225,7 @@ class PairVerdict:
         one, other = self.scores.mean
         digits = ".3f" if max(abs(one), abs(other)) >= 0.001 else ".3g"
         means = f"{one:{digits}} against {other:{digits}}"
-        p = "" if self.times.direction is Direction.UNDECIDED else f", {p_text(float(self.scores.p[0, 1]))}"
+        p = "" if self.times.direction is Direction.UNDECIDED else f", {said(float(self.scores.p[0, 1]))}"
         return (
             f"final {self.score_name}: {means}, difference {_signed(self.scores.difference[0, 1])} "
             f"({_signed(low)} to {_signed(high)}{p}); mean over the last tenth of the epochs ({self.n_last})"
@@ -372,8 +376,8 @@ def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:
 
     >>> fewer(np.array([-0.5, -0.6, -0.25]), True)
     (0.5, 0.25, 0.6)
-    >>> fewer(np.array([1.0, 0.25, 3.0]), False)
-    (0.5, 0.2, 0.75)
+    >>> fewer(np.array([1.0, 0.6, 3.0]), False)
+    (0.5, 0.375, 0.75)
     """
     value, low, high = difference.tolist()
     if first:
@@ -382,13 +386,8 @@ def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:
     return value, low, high
 
 
-def share(value: float) -> str:
-    """Write a share: `32%`, `3.4%`."""
-    return f"{100 * value:.0f}%" if abs(100 * value) >= 9.95 else f"{100 * value:.1f}%"
-
-
 def _fewer_or_more(value: float) -> str:
-    return f"{share(abs(value))} {'fewer' if value >= 0 else 'more'}"
+    return f"{share_text(abs(value))} {'fewer' if value >= 0 else 'more'}"
 
 
 def _any_of(count: int) -> str:
@@ -397,14 +396,15 @@ def _any_of(count: int) -> str:
 
 def _steps(pair: TimesPair, side: int, place: int) -> str:
     never = pair.at_cap[side, place] == 1
-    return "never" if never else steps_text(float(pair.means[side, place]), digits=3)
+    return "never" if never else mean_text(float(pair.means[side, place]))
 
 
 def _difference(values: FloatArray) -> str:
     if np.isnan(values[0]):
         return "-"
-    texts = [percent(each) for each in values.tolist()]
-    return texts[0] if np.isnan(values[1]) else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    if np.isnan(values[1]):
+        return percent(values[0])
+    return interval_text(percent, *values.tolist())
 
 
 def _signed(value: float) -> str:
@@ -412,13 +412,10 @@ def _signed(value: float) -> str:
     return f"{value:+.0f}" if abs(value) >= 100 else f"{value:+.1f}" if abs(value) >= 10 else f"{value:+.2g}"
 
 
-def p_text(p: float) -> str:
+def said(p: float) -> str:
     """Write a p value in a sentence: `p = .021`, `p < .0001`; empty where there is none."""
-    if math.isnan(p):
-        return ""
-    if p < 1e-4:
-        return "p < .0001"
-    return f"p = {p:.2g}".replace("0.", ".") if p >= 0.001 else f"p = {p:.4f}".replace("0.", ".")
+    text = p_text(p)
+    return text and (f"p < {text[1:]}" if text[0] == "<" else f"p = {text}")
 
 
 def _number(value: float) -> float | None:

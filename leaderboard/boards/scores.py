@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.engine.sheet import Sheet, flat_row
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import steps, tables
+from qrlsuite.leaderboard.boards.columns import estimate, ranks_text
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.text import steps_text
+from qrlsuite.results.text import interval_text, score_text, steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
+    AcrossTasks,
     LearningCurves,
     ScoreBoard,
     areas,
@@ -25,6 +27,7 @@ from qrlsuite.statistics import (
     last_epochs,
     rank_ranges,
 )
+from qrlsuite.table import Column, flat, record
 
 OF_RUNS = {"score": final_scores, "area": areas}
 """Numbers of each run that rank entries. Metrics in a task's `[ranking] costs` rank, too, by their final value."""
@@ -79,33 +82,32 @@ class ScoreSection:
         names, mean = self.results.names, self.sign * self.results.mean
         return tuple(sorted(range(len(names)), key=lambda index: (-mean[index], names[index])))
 
-    def columns(self) -> tuple[str, ...]:
-        """Return the heads of the table that `cells` fills."""
+    def columns(self) -> tuple[Column[int], ...]:
+        """Return the columns; a row is a place of the order."""
+        results, order, more = self.results, self.order, self.sign > 0
         level = f"{100 * (1 - self.alpha):g}%"
-        return (
-            "rank",
-            "entry",
-            "seeds",
-            f"mean ({level})",
-            f"IQM ({level})",
-            "below the first" if self.sign > 0 else "above the first",
-            f"P({'more' if self.sign > 0 else 'less'} than next)",
-        )
 
-    def cells(self, place: int) -> tuple[str, ...]:
-        """Return the row at a place of the order as text."""
-        index, results = self.order[place], self.results
-        first, after = self.order[0], self.order[place + 1 : place + 2]
-        best, worst = self.ranks[index]
-        low, high = results.difference_interval[first, index]
+        def ahead(place: int) -> str:
+            first, index = order[0], order[place]
+            difference = results.difference[first, index], *results.difference_interval[first, index]
+            return interval_text(score_text, *self._turned(*difference)) if place else "-"
+
+        def better(place: int) -> float | None:
+            return self._better(*order[place : place + 2]) if place + 1 < len(order) else None
+
         return (
-            str(best) if best == worst else f"{best}-{worst}",
-            self.entries[index].label,
-            str(len(self.entries[index].seeds)),
-            _interval(results.mean[index], *results.mean_interval[index]),
-            _interval(results.interquartile_mean[index], *results.interquartile_interval[index]),
-            _interval(*self._turned(results.difference[first, index], low, high)) if place else "-",
-            f"{self._better(index, after[0]):.2f}" if after else "-",
+            Column("ranks", lambda place: list(self.ranks[order[place]]), ranks_text, head="rank"),
+            Column(
+                "entry",
+                lambda place: self.entries[order[place]].name,
+                cell=lambda place: self.entries[order[place]].label,
+                words=True,
+            ),
+            Column("label", lambda place: self.entries[order[place]].label),
+            Column("seeds", lambda place: len(self.entries[order[place]].seeds), str),
+            *means(results, order, level),
+            Column("", ahead, head="below the first" if more else "above the first", cell=ahead),
+            Column("", better, "{:.2f}".format, head=f"P({'more' if more else 'less'} than next)"),
         )
 
     def _turned(self, value: float, low: float, high: float) -> tuple[float, float, float]:
@@ -147,9 +149,11 @@ class ScoreSection:
 
     def sheet(self, explain: bool = False) -> Sheet:
         """Return the table; `explain` adds all its notes."""
-        rows = [self.cells(place) for place in self._places()]
         label, name = f"{self.task}-{self.by}", f"{self.task} by {self.by}"
-        return Sheet.of(self.title, self.columns(), rows, self.notes(), ("entry",), label, explain, name)
+        notes = tuple(self.notes())
+        return Sheet(
+            self.title, self.columns(), self._places(), notes, explain, label=label, name=name
+        )  # fmt: skip
 
     def _places(self) -> list[int]:
         """Return the places in the order of the entries that have a row."""
@@ -158,11 +162,8 @@ class ScoreSection:
 
     def flat(self) -> list[dict[str, object]]:
         """Return one row of values per entry, for a spreadsheet."""
-        rows = self.as_dict()["entries"]
-        first = {"task": self.task, "horizon": self.horizon}
-        return [
-            flat_row(first, rows[place], {"by": self.by, "alpha": self.alpha}) for place in self._places()
-        ]
+        first, last = {"task": self.task, "horizon": self.horizon}, {"by": self.by, "alpha": self.alpha}
+        return [{**first, **flat(self.columns(), place), **last} for place in self._places()]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
@@ -174,19 +175,7 @@ class ScoreSection:
             "by": self.by,
             "last_epochs": None if self.by == "area" else self.n_last,
             "alpha": self.alpha,
-            "entries": [
-                {
-                    "entry": self.entries[index].name,
-                    "label": self.entries[index].label,
-                    "seeds": len(self.entries[index].seeds),
-                    "ranks": list(self.ranks[index]),
-                    "mean": float(results.mean[index]),
-                    "mean_interval": results.mean_interval[index].tolist(),
-                    "interquartile_mean": float(results.interquartile_mean[index]),
-                    "interquartile_interval": results.interquartile_interval[index].tolist(),
-                }
-                for index in order
-            ],
+            "entries": [record(self.columns(), place) for place in range(len(order))],
             "improvement": results.improvement[square].tolist(),
             "difference": results.difference[square].tolist(),
             "adjusted_p": [
@@ -195,6 +184,20 @@ class ScoreSection:
             "better": results.better[square].tolist(),
             "unranked": list(self.unranked),
         }
+
+
+def means(results: ScoreBoard | AcrossTasks, order: Sequence[int], level: str) -> tuple[Column[int], ...]:
+    """Return the columns of the mean and the interquartile mean; a row is a place of the order."""
+
+    def read(values: Any, ends: Any) -> Callable[[int], Sequence[float]]:
+        return lambda place: (values[order[place]], *ends[order[place]])
+
+    mean = read(results.mean, results.mean_interval)
+    middle = read(results.interquartile_mean, results.interquartile_interval)
+    return (
+        *estimate("mean", "mean_interval", mean, score_text, head=f"mean ({level})"),
+        *estimate("interquartile_mean", "interquartile_interval", middle, score_text, head=f"IQM ({level})"),
+    )
 
 
 def rank_by_score(
@@ -262,12 +265,7 @@ def sections(
     if not by_steps or not (shown is None or any(map(shown, entries))):
         return [], problems
     main = tables.main_section(by_steps)
-    members = [row.entry for row in main.rows]  # in the order of tiers, from which the bootstrap draws
+    members = [row.entry for row in main.tiers]  # in the order of tiers, from which the bootstrap draws
     section = rank_by_score(members, main.horizon, by, alpha)
     names = None if shown is None else frozenset(entry.name for entry in members if shown(entry))
     return [replace(section, shown=names)], problems
-
-
-def _interval(value: float, low: float, high: float) -> str:
-    value, low, high = (round(each, 3) + 0.0 for each in (value, low, high))  # no -0.000
-    return f"{value:.3f} ({low:.3f} to {high:.3f})"

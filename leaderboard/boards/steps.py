@@ -9,13 +9,15 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from qrlsuite.errors import PluginError, QrlSuiteError
-from qrlsuite.experiment.task import ScoreSection, digest
+from qrlsuite.experiment.task import RankingSection, ScoreSection, digest
+from qrlsuite.leaderboard.boards import columns
 from qrlsuite.leaderboard.boards.ranked import (
     Complexity,
     complexity_at,
@@ -23,14 +25,12 @@ from qrlsuite.leaderboard.boards.ranked import (
     ranking_of,
     rule_of,
 )
-from qrlsuite.leaderboard.boards.times import TimeRanking, rank_by_time
-from qrlsuite.leaderboard.rules import DEFAULT, TIMES
+from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow, rank_by_time
+from qrlsuite.leaderboard.rules import TIMES
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, final_scores, last_epochs, outperformance
+from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, last_epochs, outperformance
 from qrlsuite.statistics.compare import TOO_FEW
-
-SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
-"""Columns of a spreadsheet about the win that a tier rests on."""
+from qrlsuite.table import Column, flat, record
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,11 @@ class Support:
         """`1 of 3`: won, of the cells in which not both are at the cap."""
         return f"{self.cells} of {self.total - self.at_cap}"
 
+    @property
+    def sentence(self) -> str:
+        """Who won, and how many cells say nothing."""
+        return f"{self.winner} against {self.loser}: {self.at_cap} of {self.total} cells at the cap for both"
+
 
 @dataclass(frozen=True)
 class Row:
@@ -67,69 +72,104 @@ class Row:
 
     Attributes
     ----------
+    time:
+        Its rank, by steps below threshold.
+    costs:
+        By name, the mean over seeds and the last tenth of the epochs of what `[ranking] costs` names.
+    provisional:
+        Whether it has fewer seeds than the task's protocol asks for.
+    """
+
+    entry: EntryResults
+    time: TimeRow
+    reference: Complexity
+    costs: Mapping[str, float | None]
+    provisional: bool
+    horizon: int
+
+    @cached_property
+    def cut(self) -> EntryResults:
+        """The entry with its curves up to the horizon."""
+        return self.entry.cut(self.horizon // self.entry.steps_per_epoch) or self.entry
+
+
+@dataclass(frozen=True)
+class TieredRow(Row):
+    """One entry of a section with its tier.
+
+    Attributes
+    ----------
     tier:
         None for an entry that is undecided, or reached the goal of no cell.
     wins, losses:
         Cells of the ranking grid, over all other entries, in which it needs significantly fewer samples, and more.
+    not_reached:
+        Whether it is at the cap in every cell: below those that outperform it, not ranked among others like it.
+    rests_on:
+        None in the first tier, and without a tier.
     """
 
-    entry: EntryResults
     tier: int | None
-    reference: Complexity
-    final_score: float
-    """Mean over seeds, of each its mean over the last tenth of the epochs."""
     copeland: int
     wins: int
     losses: int
     outperforms: tuple[str, ...]
     outperformed_by: tuple[str, ...]
-    provisional: bool
-    """Fewer seeds than the task's protocol asks for."""
-    not_reached: bool = False
-    """At the cap in every cell: below the entries that outperform it, not ranked among others like it."""
-    costs: Mapping[str, float | None] = field(default_factory=dict)
-    """Metrics of `[ranking] costs` by name: means over seeds and the last tenth of the epochs."""
-    rests_on: Support | None = None
-    """None in the first tier, and without a tier."""
-
-    @property
-    def depth(self) -> float:
-        """The sort key on the board: the tier, infinity for an entry at the cap everywhere, 0 if undecided."""
-        return float("inf") if self.not_reached else float(self.tier or 0)
+    not_reached: bool
+    rests_on: Support | None
 
     @property
     def reason(self) -> str:
         """Why the entry has no tier; empty where it has one."""
-        return "" if self.tier is not None else untiered_reason(self)
+        if self.tier is not None:
+            return ""
+        if self.not_reached:
+            return "not reached: at the cap in every cell, and not ranked among each other"
+        return TOO_FEW if len(self.entry.seeds) < MIN_RUNS else "undecided: nothing to compare with"
 
 
 @dataclass(frozen=True)
 class Section:
-    """The ranking of a task's entries at one horizon."""
+    """The ranking of a task's entries at one horizon.
+
+    Attributes
+    ----------
+    provisional:
+        Whether it is shorter than the task's own horizons.
+    ranking, score:
+        The task's thresholds, cells, costs and policies; and what it scores.
+    entries:
+        All that are compared.
+    rows:
+        Those that are shown, in the order of their steps below threshold.
+    times:
+        What ranks them.
+    judge:
+        The significance rule that the tiers rest on.
+    by_tiers:
+        Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it.
+    """
 
     task: str
-    summary: str
     horizon: int
     provisional: bool
-    """Shorter than the task's own horizons."""
-    cell: str
+    ranking: RankingSection
+    score: ScoreSection
+    entries: tuple[EntryResults, ...]
     rows: tuple[Row, ...]
-    pairs: Board
-    """The verdicts of all pairs, cell by cell."""
     times: TimeRanking
-    """The same entries by steps below threshold, which ranks them."""
-    rule: str = DEFAULT
-    """Name of the significance rule that the tiers rest on."""
-    promise: str = ""
-    """The error that the rule controls."""
+    judge: SignificanceRule
     by_tiers: bool = False
-    """Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it."""
-    score: ScoreSection = field(default_factory=ScoreSection)
-    """The score that is ranked."""
-    costs: tuple[str, ...] = ()
-    """The metrics that stand beside the score."""
-    policies: Mapping[str, float] = field(default_factory=dict)
-    """Final scores of policies to compare with, by name, as the task's `[ranking.policies]` says."""
+
+    @property
+    def rule(self) -> str:
+        """Name of the significance rule that the tiers rest on."""
+        return self.judge.name
+
+    @property
+    def promise(self) -> str:
+        """The error that the rule controls."""
+        return self.judge.promise
 
     @property
     def before(self) -> str:
@@ -141,56 +181,71 @@ class Section:
         """16 hexadecimal digits of the ranked entries with their tasks, seeds and scores, in any order."""
         return digest([self.horizon, sorted(map(_content, (row.entry for row in self.rows)))])
 
+    @cached_property
+    def pairs(self) -> Board:
+        """The verdicts of all pairs, cell by cell, by the rule."""
+        curves = [learning_curves(entry) for entry in self.entries]
+        return outperformance(curves, self.ranking.grid, self.judge, horizon=self.horizon)
+
+    @cached_property
+    def tiers(self) -> tuple[TieredRow, ...]:
+        """The rows with their tiers, in the order of these."""
+        board, rows = self.pairs, {row.entry.name: row for row in self.rows}
+        labels = {entry.name: entry.label for entry in self.entries}
+        better = board.better_cells
+        capped = {place.name for place in board.ranking.not_reached}
+        return tuple(
+            TieredRow(
+                **{each.name: getattr(rows[place.name], each.name) for each in fields(Row)},
+                tier=place.tier,
+                copeland=place.copeland,
+                wins=int(better[board.names.index(place.name)].sum()),
+                losses=int(better[:, board.names.index(place.name)].sum()),
+                outperforms=tuple(labels[name] for name in place.outperforms),
+                outperformed_by=tuple(labels[name] for name in place.outperformed_by),
+                not_reached=place.name in capped,
+                rests_on=_support(board, place.rests_on, labels),
+            )
+            for place in board.ranking.entries
+            if place.name in rows
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
+        of_ranks = columns.ranks(self)
+        of_tiers: tuple[Column[TieredRow], ...] = (*columns.tiers(self), *columns.facts(self))
         return {
             "task": self.task,
             "horizon": self.horizon,
             "hash": self.hash,
             "provisional": self.provisional,
-            "cell": self.cell,
+            "cell": self.ranking.cell,
             "rule": self.rule,
-            **({"policies": dict(self.policies)} if self.policies else {}),
-            "times": self.times.as_dict(),
-            "rows": [_row_dict(row) for row in self.rows],
+            **({"policies": dict(self.ranking.policies)} if self.ranking.policies else {}),
+            "times": {**self.times.as_dict(), "entries": [record(of_ranks, row) for row in self.rows]},
+            "rows": [record(of_tiers, row) for row in self.tiers],
         }
 
     def flat(self) -> list[dict[str, object]]:
         """Return one row of values per entry in the order of the table, for a spreadsheet."""
-        place = {id(row.entry): index for index, row in enumerate(self.times.rows)}
-        rows = self.rows if self.by_tiers else sorted(self.rows, key=lambda row: place[id(row.entry)])
-        return [self._flat_row(row) for row in rows]
-
-    def _flat_row(self, row: Row) -> dict[str, object]:
-        values = _row_dict(row)
-        low, high = values.pop("interval")
-        count = values.pop("parameters")
-        tuning = values.pop("tuning") or {}
-        support = values.pop("rests_on") or {}
-        costs = values.pop("costs", {})
-        times = self.times.flat(row.entry)
-        tiers = {name: values.pop(name) for name in ("tier", "verdict")}
-        return {
-            "task": self.task,
-            "horizon": self.horizon,
-            "rank": times.pop("rank"),
-            "rank_worst": times.pop("rank_worst"),
-            **values,
-            "interval_low": low,
-            "interval_high": high,
-            "cell": self.cell,
-            "parameters_classical": count["classical"],
-            "parameters_quantum": count["quantum"],
-            "parameters_fixed": count["fixed"],
-            "networks": count["networks"],
-            "tuned": bool(tuning),
-            "tuned_on_protocol_seeds": bool(tuning.get("on_protocol_seeds")),
-            **times,
-            "rule": self.rule,
-            **tiers,
-            **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
-            **{f"cost_{name}": value for name, value in costs.items()},
-        }
+        order = {row.entry.name: place for place, row in enumerate(self.rows)}
+        rows = self.tiers if self.by_tiers else sorted(self.tiers, key=lambda row: order[row.entry.name])
+        shown = (*columns.ranks(self), *columns.facts(self))
+        return [
+            {
+                "task": self.task,
+                "horizon": self.horizon,
+                **flat(shown, row),
+                "cell": self.ranking.cell,
+                "tuned": bool(row.entry.tuning),
+                "tuned_on_protocol_seeds": row.entry.on_protocol_seeds,
+                **self.times.against(row.time),
+                "alpha": self.times.board.alpha,
+                "rule": self.rule,
+                **flat(columns.tiers(self), row),
+            }
+            for row in rows
+        ]
 
 
 def sections(
@@ -215,8 +270,11 @@ def sections(
         try:
             chosen = rule or rule_of(group)
             named = rule is not None or ranking_of(group).rule is not None
-            section = _section(task, steps, provisional, group, chosen, alpha, shown)
-            made.append(replace(section, by_tiers=named and chosen.name != TIMES))
+            by_tiers = named and chosen.name != TIMES
+            section = _section(task, steps, provisional, group, chosen, by_tiers, alpha, shown)
+            if by_tiers:
+                _ = section.tiers  # a rule that fails is reported here
+            made.append(section)
         except PluginError:
             raise
         except QrlSuiteError as error:
@@ -255,54 +313,28 @@ def _section(
     provisional: bool,
     entries: Sequence[EntryResults],
     rule: SignificanceRule,
+    by_tiers: bool,
     alpha: float,
     shown: Callable[[EntryResults], bool] | None,
 ) -> Section:
-    ranking = ranking_of(entries)
-    board = outperformance([learning_curves(entry) for entry in entries], ranking.grid, rule, horizon=horizon)
-    by_name = {entry.name: entry for entry in entries}
-    labels = {entry.name: entry.label for entry in entries}
-    protocol_seeds = entries[0].task_file.protocol.seeds
+    ranking, protocol_seeds = ranking_of(entries), entries[0].task_file.protocol.seeds
+    times = rank_by_time(entries, ranking.grid, horizon, alpha, shown)
     rows = []
-    places, better = board.ranking, board.better_cells
-    capped = {place.name for place in places.not_reached}
-    for place in places.entries:
-        entry = by_name[place.name]
-        if shown is not None and not shown(entry):
-            continue
+    for time in times.rows:
+        entry = time.entry
         values = entry.curves[:, : horizon // entry.steps_per_epoch]
         rows.append(
             Row(
                 entry=entry,
-                tier=place.tier,
+                time=time,
                 reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
-                final_score=float(final_scores(learning_curves(entry).cut(horizon)).mean()),
-                copeland=place.copeland,
-                wins=int(better[board.names.index(place.name)].sum()),
-                losses=int(better[:, board.names.index(place.name)].sum()),
-                outperforms=tuple(labels[name] for name in place.outperforms),
-                outperformed_by=tuple(labels[name] for name in place.outperformed_by),
-                provisional=len(entry.seeds) < protocol_seeds,
-                not_reached=place.name in capped,
                 costs={name: _last(entry, name, values.shape[1]) for name in ranking.costs},
-                rests_on=_support(board, place.rests_on, labels),
+                provisional=len(entry.seeds) < protocol_seeds,
+                horizon=horizon,
             )
         )
-    return Section(
-        task=task,
-        summary=entries[0].task_file.summary,
-        horizon=horizon,
-        provisional=provisional,
-        cell=ranking.cell,
-        rows=tuple(rows),
-        pairs=board,
-        times=rank_by_time(entries, ranking.grid, horizon, alpha, shown),
-        rule=rule.name,
-        promise=rule.promise,
-        score=entries[0].task_file.score,
-        costs=tuple(ranking.costs),
-        policies=ranking.policies,
-    )
+    score, compared = entries[0].task_file.score, tuple(entries)
+    return Section(task, horizon, provisional, ranking, score, compared, tuple(rows), times, rule, by_tiers)
 
 
 def _last(entry: EntryResults, name: str, epochs: int) -> float | None:
@@ -327,51 +359,6 @@ def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, st
     )
 
 
-def untiered_reason(row: Row) -> str:
-    """Return why an entry has no tier."""
-    if row.not_reached:
-        return "not reached: at the cap in every cell, and not ranked among each other"
-    if len(row.entry.seeds) < MIN_RUNS:
-        return TOO_FEW
-    return "undecided: nothing to compare with"
-
-
 def _content(entry: EntryResults) -> list[str]:
     scores = hashlib.sha256(np.array(entry.seeds, "<i8").tobytes() + entry.curves.astype("<f8").tobytes())
     return [entry.name, entry.task_hash, scores.hexdigest()]
-
-
-def _row_dict(row: Row) -> dict[str, Any]:
-    entry = row.entry
-    return {
-        "tier": row.tier,
-        "verdict": "ranked" if row.tier is not None else untiered_reason(row),
-        "rests_on": None if row.rests_on is None else asdict(row.rests_on),
-        "entry": entry.name,
-        "label": entry.label,
-        "external": entry.external,
-        "parameters": {
-            "classical": entry.parameters[0],
-            "quantum": entry.parameters[1],
-            "fixed": entry.fixed,
-            "networks": entry.networks,
-        },
-        "settings": entry.settings,
-        "seeds": len(entry.seeds),
-        "unfinished_seeds": len(entry.left_out),
-        "diverged_seeds": list(entry.diverged),
-        "provisional": row.provisional,
-        "sample_complexity": row.reference.steps,
-        "interval": [row.reference.low, row.reference.high],
-        "at_cap": row.reference.at_cap,
-        "unsettled": row.reference.unsettled,
-        "final_score": row.final_score,
-        **({"costs": dict(row.costs)} if row.costs else {}),
-        "copeland": row.copeland,
-        "wins": row.wins,
-        "losses": row.losses,
-        "outperforms": list(row.outperforms),
-        "outperformed_by": list(row.outperformed_by),
-        "core_hours": entry.hours,
-        "tuning": entry.tuning,
-    }

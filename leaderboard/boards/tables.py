@@ -6,17 +6,24 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from qrlsuite.engine.sheet import Column, Sheet
+from qrlsuite.engine.sheet import Sheet
+from qrlsuite.leaderboard.boards import columns
 from qrlsuite.leaderboard.boards.ranked import ranking_of
-from qrlsuite.leaderboard.boards.times import p_text, percent
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.notation import START
-from qrlsuite.results.text import counted, hours_text, steps_text
+from qrlsuite.results.text import (
+    counted,
+    interval_text,
+    mean_text,
+    p_text,
+    steps_text,
+)
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import TOO_FEW
+from qrlsuite.table import Column
 
 if TYPE_CHECKING:  # boards show themselves by this module
-    from qrlsuite.leaderboard.boards.steps import Row, Section
+    from qrlsuite.leaderboard.boards.steps import Section
     from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 MARKS = {
@@ -60,14 +67,14 @@ def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
     """Return a line for every entry of other horizons, and the command that shows them in a table."""
     told, lines = {row.entry.name for row in main.rows}, []
     for section in sorted(sections, key=lambda each: -each.horizon):
-        for row in section.times.rows:
+        for row in section.rows:
             if row.entry.name in told:
                 continue
             told.add(row.entry.name)
-            low, high = row.mean.interval
+            mean = row.time.mean
             lines.append(
                 f"shorter: {row.entry.label}, {counted(len(row.entry.seeds), 'seed')}, {steps_text(section.horizon)} "
-                f"steps, {_mean(row.mean.mean, low, high)} of them {section.before} threshold"
+                f"steps, {interval_text(mean_text, mean.mean, *mean.interval)} of them {section.before} threshold"
                 + f"; diverged: {_of_seeds(row.entry)}"
                 * bool(row.entry.diverged)
             )
@@ -87,13 +94,35 @@ def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
 
 def sheet(section: Section, explain: bool = False) -> Sheet:
     """Return a section as a table: ranks, or tiers where it shows these."""
-    columns = _tier_columns(section) if section.by_tiers else _rank_columns(section)
-    notes = _tier_notes(section) if section.by_tiers else _rank_notes(section)
-    promise = [f"rule '{section.rule}': {section.promise}"] * section.by_tiers
+    facts_columns = columns.facts(section)
+    shown: tuple[Column[Any], ...]
+    if section.by_tiers:
+        shown = (
+            *columns.tiers(section),
+            *(each for each in facts_columns if each.name != "sample_complexity"),
+        )
+    else:
+        shown = (*columns.ranks(section), *facts_columns)
+    remarks = notes(section, section.by_tiers, () if section.by_tiers else section.times.special())
+    rows = section.tiers if section.by_tiers else section.rows
+    return Sheet(
+        title(section), shown, rows, tuple(remarks), explain, label=f"{section.task}-{section.horizon}"
+    )
+
+
+def notes(section: Section, by_tiers: bool, special: Sequence[str] = ()) -> list[str]:
+    """Return what to know of a section beside its numbers, the most important first.
+
+    Parameters
+    ----------
+    special:
+        Lines on single pairs.
+    """
+    first, *others = tier_notes(section) if by_tiers else _rank_notes(section)
     entries = [row.entry for row in section.rows]
     warnings = [*unlike_others(entries), *_never(section), *_diverged(section), *changed_thresholds(entries)]
-    remarks = (notes[0], *warnings, *notes[1:], *_marks(section), *promise, *facts(section))
-    return Sheet(title(section), tuple(columns), remarks, explain, label=f"{section.task}-{section.horizon}")
+    promise = [f"rule '{section.rule}': {section.promise}"] * by_tiers
+    return [first, *warnings, *others, *_marks(section), *special, *promise, *facts(section)]
 
 
 def title(section: Section) -> str:
@@ -106,153 +135,6 @@ def title(section: Section) -> str:
     return f"{section.task}{only}, {steps}{' (provisional)' * section.provisional}{by}"
 
 
-def names(entries: Sequence[EntryResults]) -> list[str]:
-    """Return the names of entries in a table: their labels, without the algorithm if all share it."""
-    alike = len({entry.algorithm for entry in entries}) == 1
-    return [
-        (entry.label.removeprefix(f"{entry.algorithm} ") if alike else entry.label)
-        + " †" * entry.on_protocol_seeds
-        for entry in entries
-    ]
-
-
-def _mean(mean: float, low: float, high: float) -> str:
-    point, least, most = (steps_text(steps, digits=3) for steps in (mean, low, high))
-    return f"{point} ({least} to {most})"
-
-
-def _rank_columns(section: Section) -> list[Column]:
-    times = section.times
-    rows = [_row_of(section, row.entry) for row in times.rows]
-    longest = max((row.mean.interval[1] for row in times.rows), default=1) or 1
-    differences = ["-" if row.difference is None else percent(row.difference[0]) for row in times.rows]
-    return [
-        Column(
-            "rank",
-            tuple(row.rank_text for row in times.rows),
-            meaning="1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
-            "A outperforms B if it needs significantly fewer steps at a threshold, and significantly more at none "
-            "(permutation tests, Holm's correction over all pairs of the board, filtered out or not)",
-        ),
-        Column("entry", tuple(names([row.entry for row in times.rows])), words=True),
-        Column(
-            f"steps {section.before} threshold ({times.level})",
-            tuple(_mean(row.mean.mean, *row.mean.interval) for row in times.rows),
-            bars=tuple(
-                (row.mean.interval[0] / longest, row.mean.interval[1] / longest) for row in times.rows
-            ),
-            meaning=f"environment steps that a run spends {section.before} a threshold, mean over seeds and the "
-            "task's thresholds, with its interval; a run that never reaches one counts with the horizon. The bar is "
-            "solid to the interval's lower end and shaded to its upper end",
-        ),
-        Column(
-            "vs. first",
-            tuple(differences),
-            meaning=f"steps {section.before} threshold, against the first entry of the table",
-        ),
-        *_facts_columns(section, rows),
-    ]
-
-
-def _tier_columns(section: Section) -> list[Column]:
-    rows = section.rows
-    return [
-        Column(
-            "tier",
-            tuple(map(tier_text, rows)),
-            meaning="1 + the length of the longest chain of entries above, each of which outperforms the next",
-        ),
-        Column("entry", tuple(names([row.entry for row in rows])), words=True),
-        Column(
-            "sample complexity (5%-95%)",
-            tuple(row.reference.text for row in rows),
-            bars=tuple(
-                (row.reference.low / section.horizon, row.reference.high / section.horizon) for row in rows
-            ),
-            meaning=_complexity(section),
-        ),
-        Column(
-            "rests on",
-            tuple("-" if row.rests_on is None else row.rests_on.text for row in rows),
-            meaning="cells of the narrowest win in the chain of wins above an entry, of the cells in which not both "
-            "are at the cap",
-        ),
-        Column(
-            "cells +/-",
-            tuple(f"{row.wins}/{row.losses}" for row in rows),
-            meaning="grid cells with significantly fewer samples, and with more, over all other entries",
-        ),
-        *_facts_columns(section, rows)[1:],
-    ]
-
-
-def _complexity(section: Section) -> str:
-    """Define the sample complexity in words."""
-    goal = "score 1 - epsilon or more" if section.times.kind == "epsilon" else "have reached a threshold"
-    return f"steps until a share delta of the seeds {goal}, here at {section.cell}"
-
-
-def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
-    """Return the columns that both kinds of table end with."""
-    few = {id(row.entry) for row in section.times.rows if row.few}
-    entries = [row.entry for row in rows]
-    return [
-        Column(
-            "sample complexity",
-            tuple(">= " * row.reference.unsettled + steps_text(row.reference.steps) for row in rows),
-            meaning=_complexity(section),
-        ),
-        Column(
-            f"final {section.score.called}",
-            tuple(f"{row.final_score:.3f}" for row in rows),
-            meaning="mean over seeds and over the last tenth of the epochs",
-        ),
-        *(
-            Column(
-                name,
-                tuple(cost_text(row.costs[name]) for row in rows),
-                meaning=f"mean over the last tenth of the epochs, less is better; --by {name} ranks by it",
-            )
-            for name in section.costs
-        ),
-        Column(
-            "seeds",
-            tuple(
-                f"{len(row.entry.seeds)}{'*' * row.provisional}{'!' * (id(row.entry) in few)}" for row in rows
-            ),
-        ),
-        Column(
-            "core-hours",
-            tuple(
-                "-" if entry.external and not entry.hours else hours_text(entry.hours) for entry in entries
-            ),
-            meaning="of training",
-        ),
-        Column(
-            "parameters",
-            tuple(entry.parameters_text(" q") for entry in entries),
-            meaning="trained numbers of an agent; q: of a quantum circuit; fixed: those that stay as they were drawn",
-        ),
-        Column("settings", tuple(entry.settings for entry in entries), words=True),
-    ]
-
-
-def _row_of(section: Section, entry: EntryResults) -> Row:
-    return next(row for row in section.rows if row.entry is entry)
-
-
-def cost_text(value: float | None) -> str:
-    """Write a cost; `-` where the environment measured none."""
-    return "-" if value is None else f"{value:.3g}"
-
-
-def tier_text(row: Row) -> str:
-    """Return the tier, or in a word why there is none."""
-    if row.tier is not None:
-        return str(row.tier)
-    return "not reached" if row.not_reached else "undecided"
-
-
 def _rank_notes(section: Section) -> list[str]:
     times = section.times
     pairs = (
@@ -263,41 +145,41 @@ def _rank_notes(section: Section) -> list[str]:
     )
     lines = [
         f"rank: by significant outperformance: {pairs}",
-        f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.cell}"
+        f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.ranking.cell}"
         + policies_text(section),
     ]
-    if any(row.ranks is None for row in times.rows):
+    if any(row.time.ranks is None for row in section.rows):
         lines.append(TOO_FEW)
     return lines
 
 
 def policies_text(section: Section) -> str:
     """Return the scores of other policies, as the end of a note: `; final score of random 0.51, greedy 0.72`."""
-    told = ", ".join(f"{name} {value:.4g}" for name, value in section.policies.items())
+    told = ", ".join(f"{name} {value:.4g}" for name, value in section.ranking.policies.items())
     return f"; final {section.score.called} of {told}" * bool(told)
 
 
-def _tier_notes(section: Section) -> list[str]:
+def tier_notes(section: Section) -> list[str]:
+    """Say what tiers are, and why an entry has none."""
     return [
         "tier: 1 + the longest chain of entries above, each outperforming the next; sample complexity at "
-        f"{section.cell}{policies_text(section)}",
-        *sorted({row.reason for row in section.rows if row.reason}),
+        f"{section.ranking.cell}{policies_text(section)}",
+        *sorted({row.reason for row in section.tiers if row.reason}),
     ]
 
 
 def _marks(section: Section) -> list[str]:
-    """Explain the marks that occur, in one line, and the pairs that need a word."""
-    times, rows = section.times, section.rows
+    """Explain the marks that occur, in one line."""
+    rows = section.rows
     occurring = {
         "†": any(row.entry.on_protocol_seeds for row in rows),
         "*": any(row.provisional for row in rows),
-        "!": any(row.few for row in times.rows),
+        "!": any(row.time.few for row in rows),
         ">=": any(row.reference.unsettled for row in rows),
     }
     protocol = rows[0].entry.task_file.protocol.seeds
     marks = [f"{mark} {MARKS[mark].format(protocol=protocol)}" for mark, there in occurring.items() if there]
-    special = [] if section.by_tiers else times.trade_offs() + times.against_the_order()
-    return ["; ".join(marks)] * bool(marks) + unequal_tuning(section) + special
+    return ["; ".join(marks)] * bool(marks) + unequal_tuning(section)
 
 
 def _diverged(section: Section) -> list[str]:
@@ -311,8 +193,8 @@ def _diverged(section: Section) -> list[str]:
 
 def _never(section: Section) -> list[str]:
     """Name the ranked entries that stay below every threshold, and the axis that ranks them nevertheless."""
-    found = [row for row in section.times.rows if row.at_cap == 1 and row.ranks is not None]
-    told = ", ".join(name for name in names([row.entry for row in found]))
+    found = [row for row in section.rows if row.time.at_cap == 1 and row.time.ranks is not None]
+    told = ", ".join(name for name in columns.names([row.entry for row in found]))
     line = (
         f"no seed reached a threshold, so steps do not tell them apart: {told}. --by area ranks by the learning "
         "curves alone"
@@ -450,12 +332,12 @@ SIGNS = {Direction.FEWER: "+", Direction.MORE: "-", Direction.TRADE_OFF: "+/-"}
 def pairs_sheet(section: Section) -> Sheet:
     """Return the matrix of all pairs: who outperforms whom, by the board's ranks or by the cells of its tiers."""
     if section.by_tiers:
-        rows = [row.entry for row in section.rows]
+        rows = [row.entry for row in section.tiers]
         order = [section.pairs.names.index(entry.name) for entry in rows]
         texts = [[_cells_text(section, i, j) for j in order] for i in order]
         notes = ["+n: the row's entry needs significantly fewer samples in n cells; -n: more; . in none"]
     else:
-        rows, order = [row.entry for row in section.times.rows], list(section.times.order)
+        rows, order = [row.entry for row in section.rows], list(section.times.order)
         texts = [[_decision_text(section, i, j) for j in order] for i in order]
         notes = [
             "+ the row's entry outperforms the column's; - the reverse; +/- a trade-off; a number: adjusted p of a "
@@ -464,12 +346,9 @@ def pairs_sheet(section: Section) -> Sheet:
     if any("?" in line for line in texts):
         notes.append(f"? {TOO_FEW}")
     places = [str(place + 1) for place in range(len(order))]
-    columns = [
-        Column("", tuple(places)),
-        Column("entry", tuple(names(rows)), words=True),
-        *(Column(head, tuple(line[place] for line in texts)) for place, head in enumerate(places)),
-    ]
-    return Sheet(f"{title(section)}: pairs", tuple(columns), tuple(notes), label=f"{section.task}-pairs")
+    lines = [(place, name, *line) for place, name, line in zip(places, columns.names(rows), texts)]
+    heads = ("", "entry", *places)
+    return Sheet.of(f"{title(section)}: pairs", heads, lines, notes, ("entry",), f"{section.task}-pairs")
 
 
 def _decision_text(section: Section, i: int, j: int) -> str:
@@ -479,7 +358,7 @@ def _decision_text(section: Section, i: int, j: int) -> str:
         return ""
     if direction is Direction.UNDECIDED:
         return "?"
-    return SIGNS.get(direction, p_text(board.adjusted[i, j]).removeprefix("0"))
+    return SIGNS.get(direction, p_text(board.adjusted[i, j]))
 
 
 def _cells_text(section: Section, i: int, j: int) -> str:

@@ -12,7 +12,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
+from qrlsuite.results.text import interval_text, percent
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    Direction,
+    Grid,
+    LearningCurves,
+    MeanTime,
+    TimesBoard,
+    times_board,
+)
 
 ALPHA = 0.05
 
@@ -49,18 +58,14 @@ class TimeRow:
     @property
     def rank_text(self) -> str:
         """`3`, `3-5`, or `-` below 20 seeds."""
-        if self.ranks is None:
-            return "-"
-        best, worst = self.ranks
-        return str(best) if best == worst else f"{best}-{worst}"
+        return "-" if self.ranks is None else "-".join(map(str, dict.fromkeys(self.ranks)))
 
     @property
     def difference_text(self) -> str:
         """`+12% (+8% to +17%)`, `-` where there is none."""
         if self.difference is None:
             return "-"
-        value, low, high = map(percent, self.difference)
-        return f"{value} ({low} to {high})"
+        return interval_text(percent, *self.difference)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +128,12 @@ class TimeRanking:
             if self.board.directions[i][j] is Direction.MORE
         ]
 
+    def special(self) -> list[str]:
+        """Return a line for every pair that needs a word."""
+        return self.trade_offs() + self.against_the_order()
+
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
+        """Return plain values of all pairs, for JSON. Matrices are in the order of `rows`, from the row's side."""
         order = list(self.order)
         return {
             "alpha": self.board.alpha,
@@ -132,7 +141,6 @@ class TimeRanking:
             self.kind: [float(level) for level in self.levels],
             "pairs": self.n_pairs,
             "decided": self.n_decided,
-            "entries": [self.row_dict(row) for row in self.rows],
             "adjusted_p": [[_number(self.board.adjusted[i, j]) for j in order] for i in order],
             "verdicts": [
                 [None if i == j else str(self.board.directions[i][j]) for j in order] for i in order
@@ -146,49 +154,18 @@ class TimeRanking:
             "against_the_order": self.against_the_order(),
         }
 
-    def row_dict(self, row: TimeRow) -> dict[str, Any]:
-        """Return one entry's plain values."""
+    def told_apart_from_next(self, row: TimeRow) -> bool | None:
+        """Return whether a row and the one below are decided; None where one of them is not ranked."""
         index = self.rows.index(row)
-        following = self.rows[index + 1] if index + 1 < len(self.rows) else None
-        apart = None
-        if row.ranks is not None and following is not None and following.ranks is not None:
-            apart = decided(self.board.directions[self.order[index]][self.order[index + 1]])
-        return {
-            "entry": row.entry.name,
-            "place": row.place,
-            "place_at_half": row.place_at_half,
-            "ranks": None if row.ranks is None else list(row.ranks),
-            "mean_time": row.mean.mean,
-            "interval": list(row.mean.interval),
-            "mean_time_at_half": row.mean.half,
-            "at_cap": row.at_cap,
-            "at_cap_by_threshold": [float(share) for share in row.mean.at_cap],
-            "difference_to_first": None if row.difference is None else row.difference[0],
-            "difference_interval": None if row.difference is None else list(row.difference[1:]),
-            "told_apart_from_next": apart,
-            "few_and_unequal": row.few,
-        }
+        below = self.rows[index + 1 : index + 2]
+        if row.ranks is None or not below or below[0].ranks is None:
+            return None
+        return decided(self.board.directions[self.order[index]][self.order[index + 1]])
 
-    def flat(self, entry: EntryResults) -> dict[str, object]:
-        """Return the columns of one entry for a spreadsheet; p of pairs as `entry: p; ...` under the entry's name."""
-        row = next(row for row in self.rows if row.entry is entry)
-        i = self.order[self.rows.index(row)]
-        low, high = row.mean.interval
-        difference = row.difference or (None, None, None)
-        names = self.board.names
+    def against(self, row: TimeRow) -> dict[str, object]:
+        """Return a row's pairs for a spreadsheet: every adjusted p as `entry: p`, and the trade-offs."""
+        i, names = self.order[self.rows.index(row)], self.board.names
         return {
-            "rank": None if row.ranks is None else row.ranks[0],
-            "rank_worst": None if row.ranks is None else row.ranks[1],
-            "time_place": row.place,
-            "time_place_at_half": row.place_at_half,
-            "mean_time": row.mean.mean,
-            "mean_time_low": low,
-            "mean_time_high": high,
-            "times_at_cap": row.at_cap,
-            "times_few_and_unequal": row.few,
-            "difference_to_first": difference[0],
-            "difference_low": difference[1],
-            "difference_high": difference[2],
             "adjusted_p": [
                 f"{names[j]}: {self.board.adjusted[i, j]:.6g}"
                 for j in self.order
@@ -197,7 +174,6 @@ class TimeRanking:
             "trade_offs": [
                 names[j] for j in self.order if self.board.directions[i][j] is Direction.TRADE_OFF
             ],
-            "alpha": self.board.alpha,
         }
 
     def _pairs(self) -> list[tuple[int, int]]:
@@ -246,7 +222,11 @@ def rank_by_time(
         first, difference = order[0], None
         if known and index != first and not math.isnan(board.difference[index, first]):
             low, high = board.difference_interval[index, first]
-            difference = (float(board.difference[index, first]), float(low), float(high))
+            difference = (
+                float(board.difference[index, first]),
+                float(low),
+                float(high),
+            )
         best, worst = board.ranks[index].tolist()
         rows.append(
             TimeRow(
@@ -264,26 +244,17 @@ def rank_by_time(
             )
         )
     return TimeRanking(
-        board, tuple(rows), order, grid.level_name, tuple(f"{float(level):g}" for level in grid.levels)
+        board,
+        tuple(rows),
+        order,
+        grid.level_name,
+        tuple(f"{float(level):g}" for level in grid.levels),
     )
 
 
 def decided(direction: Direction) -> bool:
     """Return whether a pair is decided; a trade-off counts."""
     return direction in (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
-
-
-def percent(share: float) -> str:
-    """Write a difference: `+12%`, `-3.4%`."""
-    value = 100 * share
-    return f"{value:+.0f}%" if abs(value) >= 9.95 else f"{value:+.1f}%"
-
-
-def p_text(p: float) -> str:
-    """Write a p value: `0.021`, `<.001`; empty where there is none."""
-    if math.isnan(p):
-        return ""
-    return "<.001" if p < 0.001 else f"{p:.3f}"
 
 
 def _number(value: float) -> float | None:

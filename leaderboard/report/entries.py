@@ -15,7 +15,7 @@ from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
 from qrlsuite.leaderboard.report.words import ranges
 from qrlsuite.leaderboard.shelf.curves import EntryResults, registered_task
 from qrlsuite.notation import write_setting
-from qrlsuite.results.text import counted
+from qrlsuite.results.text import counted, hours_text
 
 LONGEST_COMMAND = 1000
 SINGLE_RUNS = 100_000
@@ -90,7 +90,7 @@ def _facts(entry: EntryResults) -> list[tuple[str, str]]:
         ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
-        ("Core-hours", f"{entry.hours:.2f}"),
+        ("Core-hours", hours_text(entry.hours)),
         ("Circuit executions", _told(entry.executions)),
         ("Preset", _told(entry.preset)),
         ("Versions", _told(entry.versions)),

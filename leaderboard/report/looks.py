@@ -10,6 +10,7 @@ from typing import Any
 
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.text import p_text
 from qrlsuite.studies.outcome import (
     StudyOutcome,
     difference_text,
@@ -154,7 +155,7 @@ def _look(outcome: StudyOutcome, index: int) -> LookLine:
     for pair in outcome.pairs:
         has_p = index < len(pair.p)
         last = index == len(pair.p) - 1
-        cells.append((f"{pair.p[index]:.2g}" if has_p else "", has_p and last and pair.differs))
+        cells.append((p_text(pair.p[index]) if has_p else "", has_p and last and pair.differs))
     return LookLine(
         seeds=seeds,
         taken=_minute(taken[seeds]) if seeds in taken else "–",

@@ -54,7 +54,7 @@
     const compare = (a, b) => {
       const [x, y] = [value(a), value(b)];
       if (x === "" || y === "") return (x === "") - (y === ""); // what has no value stays last
-      const order = ["entry", "settings"].includes(key) ? x.localeCompare(y, "en", { numeric: true }) : Number(x) - Number(y);
+      const order = headers[column].dataset.words === "1" ? x.localeCompare(y, "en", { numeric: true }) : Number(x) - Number(y);
       return direction === "ascending" ? order : -order;
     };
     const rows = [...table.tBodies[0].rows].sort(compare);
@@ -69,7 +69,7 @@
     const select = element("select", {});
     for (const cell of headers) {
       const name = cell.textContent;
-      const best = ["score", "seeds"].includes(cell.dataset.key) ? "descending" : "ascending";
+      const best = cell.dataset.most === "1" ? "descending" : "ascending";
       const control = element("button", { type: "button" }, name);
       control.addEventListener("click", () => {
         const now = cell.getAttribute("aria-sort");

@@ -13,13 +13,12 @@ from markupsafe import Markup
 
 import qrlsuite
 from qrlsuite.leaderboard.boards.board import Leaderboard
-from qrlsuite.leaderboard.boards.tables import cost_text, main_section, policies_text
-from qrlsuite.leaderboard.report import entries, sections, winners
+from qrlsuite.leaderboard.boards.tables import main_section
+from qrlsuite.leaderboard.report import entries, rows, sections, winners
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.studies.outcome import StudyOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"
@@ -54,7 +53,7 @@ def render(
         Whether `qrlsuite.leaderboard.report.live` serves it: it then asks its server for the progress of runs, and for
         a newer page.
     """
-    curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
+    curves = {id(row.entry): row.entry for section in board.sections for row in section.tiers}
     shown = entries.views(list(curves.values()))
     by_curves = {id(entry.curves): entry for entry in shown}
     boards = [sections.view(section, number, by_curves) for number, section in enumerate(board.sections)]
@@ -81,7 +80,6 @@ def render(
             tasks=len(tasks),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,
-            too_few=TOO_FEW,
             rule=board.rule,
             promise=clean(board.promise, LONGEST_REASON),
             paper=PAPER,
@@ -92,8 +90,9 @@ def render(
             scripts=[Markup(script) for script in scripts],
             clean=clean,
             counted=counted,
-            cost_text=cost_text,
-            policies_text=policies_text,
+            sentence=rows.sentence,
+            cell=rows.cell,
+            sorted_by=rows.sorted_by,
         )
     )
 

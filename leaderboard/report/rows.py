@@ -1,34 +1,37 @@
-"""A line of a board as the page shows it."""
+"""A line of a board as the page shows it, and the cells of its columns."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Any
 
-from qrlsuite.leaderboard.boards.steps import Row, Section
+from qrlsuite.leaderboard.boards.steps import Row
 from qrlsuite.leaderboard.boards.times import TimeRow
+from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
-from qrlsuite.results.text import steps_text
+from qrlsuite.results.text import mean_text
+from qrlsuite.table import Column
 
 
 @dataclass(frozen=True)
 class RowView:
-    """A line of the leaderboard; `low`, `point` and `high` are the mean's, in percent of the horizon."""
+    """A line of the leaderboard; `name` is the label, without the algorithm if all entries of the board share it."""
 
     place: int
     entry: EntryView
     name: str
-    """The label, without the algorithm if all entries of the board share it."""
     row: Row
-    time: TimeRow
-    mean: str
-    mean_interval: str
-    at_cap: str
-    low: float
-    point: float
-    high: float
-    steps: str
-    interval: str
-    reason: str
+
+    @property
+    def time(self) -> TimeRow:
+        """Its rank."""
+        return self.row.time
+
+    @property
+    def mean(self) -> str:
+        """Its mean steps below threshold."""
+        return mean_text(self.time.mean.mean)
 
     @property
     def kind(self) -> str:
@@ -38,25 +41,31 @@ class RowView:
         return "quantum" if self.entry.quantum else "classical"
 
 
-def row_view(place: int, row: Row, entry: EntryView, name: str, section: Section) -> RowView:
-    """Return the line of a place from its row and its entry."""
-    reference, horizon, time = row.reference, section.horizon, section.times.rows[place]
-    mean, low, high = time.mean.mean, *time.mean.interval
-    kind, levels = section.times.kind, section.times.levels
-    shares = (f"{kind} {level}: {share:.0%}" for level, share in zip(levels, time.mean.at_cap))
-    return RowView(
-        place=place,
-        entry=entry,
-        name=name,
-        row=row,
-        time=time,
-        mean=steps_text(mean, digits=3),
-        mean_interval=f"{steps_text(low, digits=3)} to {steps_text(high, digits=3)}",
-        at_cap=f"never there: {', '.join(shares)}; {steps_text(round(time.mean.half))} at half the horizon",
-        low=100 * low / horizon,
-        point=100 * mean / horizon,
-        high=100 * high / horizon,
-        steps=("≥ " if reference.unsettled else "") + steps_text(reference.steps),
-        interval=f"{steps_text(reference.low)} to {steps_text(reference.high)}",
-        reason=row.reason,
-    )
+def sentence(line: str, longest: int = 1000) -> str:
+    """Return a note or a head with a capital letter."""
+    text = clean(line, longest)
+    return text[:1].upper() + text[1:]
+
+
+def cell(column: Column[Any], row: Any) -> tuple[str, str]:
+    """Return a cell in two parts, the second in gray: the interval of a number."""
+    text, beside = clean(column.written(row), 600), column.beside(row) if column.beside else ""
+    if not column.words and text.endswith(")"):
+        text, _, rest = text.partition(" (")
+        beside = f"({rest}"
+    return _typeset(text), _typeset(clean(beside))
+
+
+def sorted_by(column: Column[Any], row: Any) -> str | float:
+    """Return what the page sorts a column by; empty where a row has no value."""
+    value = column.value(row)
+    value = value[0] if isinstance(value, list) else value
+    return "" if value is None else clean(value) if isinstance(value, str) else value
+
+
+def _typeset(text: str) -> str:
+    """Write dashes, minus and `≥` as print does."""
+    if text == "-":
+        return "–"
+    text = re.sub(r"^(\d+)-(\d+)$", r"\1–\2", text.replace(">= ", "≥ "))
+    return re.sub(r"(?<![\w-])-(?=\d)", "−", text)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.boards import tables
+from qrlsuite.leaderboard.boards import columns, tables
 from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.steps import Section
@@ -20,14 +20,13 @@ from qrlsuite.leaderboard.report.cite import Citation, cite
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView, changed_options
 from qrlsuite.leaderboard.report.judge import Judgement, judge
-from qrlsuite.leaderboard.report.rows import RowView, row_view
+from qrlsuite.leaderboard.report.rows import RowView
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.winners import Winners, winners
-from qrlsuite.leaderboard.report.words import listed
-from qrlsuite.leaderboard.shelf.absent import absent
-from qrlsuite.results.text import counted, steps_text
+from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.statistics import Evidence, Grid, Outcome
 from qrlsuite.statistics.compare import TOO_FEW
+from qrlsuite.table import Column
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
@@ -55,16 +54,10 @@ class SectionView:
     sentences: tuple[tuple[int, int, str], ...]
     """Two places, and the verdict of the board on them."""
     rows: tuple[RowView, ...]
-    by_tier: tuple[RowView, ...]
-    """The same in the order of the tiers."""
-    protocol_seeds: int
-    missing: str
-    first_alone: str
-    unlike_others: str
-    """Which entries other programs trained, and which began with trained agents."""
-    tuning: str
-    flattered: str
-    """Entries whose settings were chosen on the protocol's seeds."""
+    columns: tuple[Column[Any], ...]
+    notes: tuple[str, ...]
+    tier_columns: tuple[Column[Any], ...]
+    tier_notes: tuple[str, ...]
     ladder: ladder.Ladder
     matrix: tuple[tuple[tuple[str, str], ...], ...]
     surfaces: tuple[tuple[tuple[CellView, ...], ...], ...]
@@ -84,11 +77,6 @@ class SectionView:
         """Number of other entries that each one may outperform."""
         return len(self.rows) - 1
 
-    @property
-    def quantum(self) -> bool:
-        """Whether any entry has quantum parameters."""
-        return any(row.entry.quantum for row in self.rows)
-
 
 def view(section: Section, number: int, entries: dict[int, EntryView]) -> SectionView:
     """Return a section of the page.
@@ -98,9 +86,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     entries:
         The page's entries by the identity of their curves.
     """
-    by_entry = {id(row.entry): row for row in section.rows}
-    by_tier = list(by_entry)
-    section = replace(section, rows=tuple(by_entry[id(time.entry)] for time in section.times.rows))
+    tier_columns = tuple(each for each in columns.tiers(section) if each.shown)
     judgement = judge(section)
     ranking = ranking_of([row.entry for row in section.rows])
     algorithms = {row.entry.algorithm for row in section.rows}
@@ -110,8 +96,8 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     if len(set(names)) < len(names):
         names = [entry.label for entry in shown]
     rows = tuple(
-        row_view(place, *each, section)
-        for place, each in enumerate(zip(section.rows, shown, names, strict=True))
+        RowView(place, entry, name, row)
+        for place, (row, entry, name) in enumerate(zip(section.rows, shown, names, strict=True))
     )
     order = np.array(section.times.order)
     grid = judgement.grid
@@ -119,7 +105,6 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
     levels = [f"{float(value):g}" for value in grid.levels]
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
-    missing = sorted({clean(name) for row in section.rows for name in absent(row.entry)})
     surfaces = tuple(surface(judgement.own(place), ranking) for place in range(len(rows)))
     winning = winners(rows, section.times)
     asked = winning.asked(rows)
@@ -143,13 +128,13 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
             for one, other in itertools.combinations(rows, 2)
         ),
         rows=rows,
-        by_tier=tuple(sorted(rows, key=lambda row: by_tier.index(id(row.row.entry)))),
-        protocol_seeds=section.rows[0].entry.task_file.protocol.seeds,
-        missing=listed(missing) if missing else "",
-        first_alone=", ".join(row.name for row in rows if row.row.entry.first_network_alone),
-        unlike_others=clean("; ".join(tables.unlike_others([row.entry for row in section.rows]))),
-        tuning=clean("; ".join(tables.unequal_tuning(section))),
-        flattered=", ".join(row.name for row in rows if row.row.entry.on_protocol_seeds),
+        columns=tuple(each for each in (*columns.ranks(section), *columns.facts(section)) if each.shown),
+        notes=tuple(tables.notes(section, by_tiers=False)),
+        tier_columns=tier_columns,
+        tier_notes=(
+            *(f"{each.title}: {each.meaning}" for each in tier_columns if each.meaning),
+            *tables.tier_notes(section),
+        ),
         ladder=ladder.draw(
             section.times.board.outperforms[np.ix_(order, order)],
             [0.0 if time.ranks is None else float(time.ranks[0]) for time in section.times.rows],
@@ -239,7 +224,7 @@ def _data(
         "entries": [row.entry.index for row in rows],
         "names": [row.name for row in rows],
         "level": level,
-        "policies": [[clean(name), value] for name, value in section.policies.items()],
+        "policies": [[clean(name), value] for name, value in section.ranking.policies.items()],
         "score": f"{'' if external else 'validation '}{clean(section.score.called)}"
         f"{' (received / optimal)' * section.score.of_optimum}",
         "levelName": symbol(judgement.grid),
@@ -273,8 +258,7 @@ def extent(sections: Sequence[SectionView], entries: Sequence[EntryView]) -> str
     tasks = {view.section.task for view in sections}
     runs = sum(len(entry.curves.seeds) for entry in entries)
     hours = sum(entry.curves.hours for entry in entries)
-    spent = f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
     return (
         f"{counted(len(entries), 'entry')} on {counted(len(tasks), 'task')}, "
-        f"{counted(runs, 'run')}, {spent} core-hours"
+        f"{counted(runs, 'run')}, {hours_text(hours)} core-hours"
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from qrlsuite.leaderboard.boards.times import TimeRanking, p_text
+from qrlsuite.leaderboard.boards.times import TimeRanking
+from qrlsuite.results.text import p_text
 from qrlsuite.statistics import Direction
 
 STYLES = {Direction.FEWER: "win", Direction.MORE: "loss", Direction.TRADE_OFF: "both"}

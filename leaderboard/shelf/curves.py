@@ -25,7 +25,7 @@ from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance
 from qrlsuite.results.records import MEASURED, EntryRecord, Provenance
 from qrlsuite.results.seeds import parse_seeds, read_seeds
-from qrlsuite.results.text import counted
+from qrlsuite.results.text import counted, hours_text
 
 BESIDE = "-published"
 """The mark of a published entry that stands beside own runs of it."""
@@ -458,7 +458,7 @@ class EntryResults(Shown):
             **({"left out": "; ".join(self.refused)} if self.refused else {}),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
             f"last {self.task_file.score.called}": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
-            "core-hours": f"{self.hours:.2f}" if self.hours or not self.external else "-",
+            "core-hours": hours_text(self.hours) if self.hours or not self.external else "-",
             "read from": ", ".join(map(str, self.folders)),
         }
 
@@ -479,12 +479,12 @@ class EntryResults(Shown):
         classical, quantum = self.parameters
         if self.external and not classical + quantum:
             return "-"
-        return (f"{classical} + {quantum}{unit}" if quantum else f"{classical}") + self.fixed_text
+        return (f"{classical:,} + {quantum:,}{unit}" if quantum else f"{classical:,}") + self.fixed_text
 
     @property
     def fixed_text(self) -> str:
         """A note on numbers that stay as drawn: ` (240 fixed)`; empty if there are none."""
-        return f" ({self.fixed} fixed)" if self.fixed else ""
+        return f" ({self.fixed:,} fixed)" if self.fixed else ""
 
     @property
     def legend(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import re
 import textwrap
@@ -10,6 +11,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from operator import itemgetter
 from typing import Any, Literal
 
 from rich import box
@@ -18,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite.engine.terminal import printable
+from qrlsuite.table import Column
 
 WIDE = 165
 """Characters per line of a table that is written into a pipe or a file."""
@@ -31,49 +34,16 @@ _PLAIN = str.maketrans("█▒†", "#=+")
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of a sheet.
-
-    Attributes
-    ----------
-    head:
-        Its name.
-    cells:
-        A text per row.
-    words:
-        Whether these are words, which stand at the left and may be broken into lines; numbers stand at the right.
-    bars:
-        Per row the ends of a bar's solid and shaded part, in shares of the longest; None where there is no bar.
-        Only a terminal shows them.
-    meaning:
-        Explanation of the column; empty if the head is enough.
-    """
-
-    head: str
-    cells: tuple[str, ...]
-    words: bool = False
-    bars: tuple[tuple[float, float] | None, ...] = ()
-    meaning: str = ""
-
-    @property
-    def width(self) -> int:
-        """Characters that it needs: of its longest cell, or of the longest word of its head."""
-        return max(map(len, (*self.cells, *self.head.replace("-", "- ").split())), default=0)
-
-    @property
-    def least(self) -> int:
-        """Characters that it needs: with its bars, and with its words folded."""
-        return min(self.width, FOLDED) if self.words else self.width + (BAR[0] + 1) * bool(self.bars)
-
-
-@dataclass(frozen=True)
 class Sheet:
     """A table with title and notes.
 
     Attributes
     ----------
     columns:
-        In the order of their importance: where a line has no room for all, the last are left out.
+        In the order of their importance: where a line has no room for all, the last are left out. Those that no table
+        shows are left out.
+    rows:
+        What the columns write.
     notes:
         In the order of their importance: the first three are written, unless `explained`.
     explained:
@@ -87,7 +57,8 @@ class Sheet:
     """
 
     title: str
-    columns: tuple[Column, ...]
+    columns: tuple[Column[Any], ...]
+    rows: Sequence[Any] = ()
     notes: tuple[str, ...] = ()
     explained: bool = False
     lines: tuple[str, ...] = ()
@@ -106,23 +77,27 @@ class Sheet:
         explained: bool = False,
         name: str = "",
     ) -> Sheet:
-        """Return the sheet of some rows; `words` names the columns of words."""
+        """Return the sheet of some rows of text; `words` names the columns of words."""
         columns = (
-            Column(head, tuple(row[place] for row in rows), head in words) for place, head in enumerate(heads)
+            Column("", itemgetter(place), str, head=head, words=head in words)
+            for place, head in enumerate(heads)
         )
-        return cls(title, tuple(columns), tuple(notes), explained, label=label, name=name)
+        return cls(title, tuple(columns), rows, tuple(notes), explained, label=label, name=name)
 
-    @property
-    def rows(self) -> list[tuple[str, ...]]:
-        """The cells, row by row."""
-        return list(zip(*(column.cells for column in self.columns)))
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", tuple(column for column in self.columns if column.shown))
 
-    def remarks(self, columns: Sequence[Column] | None = None) -> list[str]:
+    @functools.cached_property
+    def cells(self) -> list[tuple[str, ...]]:
+        """The text of every cell, row by row."""
+        return [tuple(column.written(row) for column in self.columns) for row in self.rows]
+
+    def remarks(self, columns: Sequence[Column[Any]] | None = None) -> list[str]:
         """Return the notes below a table: all columns' in a file, these columns' in a terminal."""
         shown = self.columns if columns is None else columns
         if self.explained:
-            meanings = [f"{column.head}: {column.meaning}" for column in shown if column.meaning]
-            left_out = [column.head for column in self.columns if column not in shown]
+            meanings = [f"{column.title}: {column.meaning}" for column in shown if column.meaning]
+            left_out = [column.title for column in self.columns if column not in shown]
             room = [f"a wider terminal, or --format markdown, also shows {', '.join(left_out)}"] * bool(
                 left_out
             )
@@ -148,27 +123,53 @@ class Sheet:
             caption=Text("\n".join(self.remarks(shown))),
             caption_justify="left",
         )
+        texts = {id(column): [row[k] for row in self.cells] for k, column in enumerate(self.columns)}
         for column in shown:
-            room = max(column.width, column.least + spare if column.bars else 0)
-            lines = (
-                [column.head] if column.words else textwrap.wrap(column.head, room, break_long_words=False)
-            )
-            justify: Literal["left", "right"] = "left" if column.words or column.bars else "right"
+            width = self._width(column)
+            room = max(width, self._least(column) + spare if column.bar else 0)
+            title = column.title
+            lines = [title] if column.words else textwrap.wrap(title, room, break_long_words=False)
+            justify: Literal["left", "right"] = "left" if column.words or column.bar else "right"
             table.add_column(
                 Text("\n".join(lines)), justify=justify, overflow="fold", no_wrap=not column.words
             )
-        for place in range(len(shown[0].cells)):
-            texts = (_with_bar(column, place, BAR[0] + spare) for column in shown)
-            plain = "" if encoding.lower().startswith("utf") else _PLAIN
-            table.add_row(*(Text(text.translate(plain) if plain else text) for text in texts))
+            if column.bar:
+                bars = self._bars(column, BAR[0] + spare)
+                texts[id(column)] = [
+                    f"{text:<{width}} {bar}" if bar else text for text, bar in zip(texts[id(column)], bars)
+                ]
+        plain = {} if encoding.lower().startswith("utf") else _PLAIN
+        for cells in zip(*(texts[id(column)] for column in shown)):
+            table.add_row(*(Text(text.translate(plain)) for text in cells))
         return table
 
-    def _fitting(self, width: int) -> tuple[list[Column], int]:
+    def _width(self, column: Column[Any]) -> int:
+        """Return the characters that a column needs: of its longest cell, or of the longest word of its head."""
+        place = self.columns.index(column)
+        return max(map(len, (*(row[place] for row in self.cells), *column.title.replace("-", "- ").split())))
+
+    def _least(self, column: Column[Any]) -> int:
+        """Return the characters that a column needs with its bars, and with its words folded."""
+        width = self._width(column)
+        return min(width, FOLDED) if column.words else width + (BAR[0] + 1) * bool(column.bar)
+
+    def _bars(self, column: Column[Any], length: int) -> list[str]:
+        """Return a bar for each row, solid to its low end and shaded to its high end; the longest has a length."""
+        ends = [column.bar(row) if column.bar else None for row in self.rows]
+        longest = max((bar[2] for bar in ends if bar), default=1) or 1
+        bars = []
+        for bar in ends:
+            solid, shaded = (round(length * bar[end] / longest) for end in (0, 2)) if bar else (0, 0)
+            bars.append("█" * solid + "▒" * (shaded - solid))
+        return bars
+
+    def _fitting(self, width: int) -> tuple[list[Column[Any]], int]:
         """Return the columns for which a line has room, and the characters left for longer bars."""
         shown = list(self.columns)
+        least = {id(column): self._least(column) for column in shown}
 
         def spare() -> int:
-            return width - sum(column.least for column in shown) - 2 * (len(shown) - 1)
+            return width - sum(least[id(column)] for column in shown) - 2 * (len(shown) - 1)
 
         while len(shown) > 2 and spare() < 0:
             shown.pop()
@@ -176,9 +177,9 @@ class Sheet:
 
     def markdown(self) -> str:
         """Return heading, table and notes as Markdown."""
-        heads = [column.head for column in self.columns]
+        heads = [column.title for column in self.columns]
         lines = [f"### {_plain(self.title)}", "", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
-        lines += [f"| {' | '.join(map(_plain, row))} |" for row in self.rows]
+        lines += [f"| {' | '.join(map(_plain, row))} |" for row in self.cells]
         return "\n".join([*lines, "", *(f"{_plain(line, '')}  " for line in self.remarks()), ""])
 
     def html(self) -> str:
@@ -189,8 +190,8 @@ class Sheet:
             texts = (f"<{tag}{place}>{escape(cell)}</{tag}>" for place, cell in zip(places, cells))
             return f"<tr>{''.join(texts)}</tr>"
 
-        head = row((column.head for column in self.columns), "th")
-        body = "".join(row(cells, "td") for cells in self.rows)
+        head = row((column.title for column in self.columns), "th")
+        body = "".join(row(cells, "td") for cells in self.cells)
         return (
             (f"<p><b>{escape(self.title)}</b></p>" if self.title else "")
             + f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
@@ -203,7 +204,7 @@ class Sheet:
         caption = " ".join(
             f"{escaped(line[:1].upper() + line[1:])}." for line in (self.title, *self.remarks())
         )
-        lines = [" & ".join(map(_math, row)) + r" \\" for row in self.rows]
+        lines = [" & ".join(map(_math, row)) + r" \\" for row in self.cells]
         return "\n".join(
             [
                 "% needs \\usepackage{booktabs}",
@@ -213,7 +214,7 @@ class Sheet:
                 rf"  \label{{tab:{''.join(c if c.isascii() and c.isalnum() else '-' for c in self.label)}}}",
                 rf"  \begin{{tabular}}{{{spec}}}",
                 r"    \toprule",
-                f"    {' & '.join(escaped(column.head) for column in self.columns)} " + r"\\",
+                f"    {' & '.join(escaped(column.title) for column in self.columns)} " + r"\\",
                 r"    \midrule",
                 *(f"    {line}" for line in lines),
                 r"    \bottomrule",
@@ -222,17 +223,6 @@ class Sheet:
                 "",
             ]
         )
-
-
-def _with_bar(column: Column, place: int, length: int) -> str:
-    text = column.cells[place]
-    if not column.bars:
-        return text
-    ends = column.bars[place]
-    if ends is None:
-        return text
-    solid, shaded = (round(length * end) for end in ends)
-    return f"{text:<{column.width}} {'█' * solid}{'▒' * (shaded - solid)}"
 
 
 def _plain(text: str, further: str = "`|") -> str:
@@ -263,28 +253,12 @@ def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
     writer = csv.DictWriter(buffer, list(names), lineterminator="\n")
     writer.writeheader()
     for row in rows:
-        flat = {name: "; ".join(value) if isinstance(value, list) else value for name, value in row.items()}
+        flat = {
+            name: "; ".join(map(str, value)) if isinstance(value, list) else value
+            for name, value in row.items()
+        }
         writer.writerow({name: _harmless(value) for name, value in flat.items()})
     return buffer.getvalue()
-
-
-def flat_row(
-    first: Mapping[str, object], values: Mapping[str, Any], last: Mapping[str, object]
-) -> dict[str, object]:
-    """Return a row for a spreadsheet: `ranks` and intervals of `values` become two columns each, the rank comes first.
-
-    >>> flat_row({"task": "a"}, {"entry": "b", "ranks": [1, 3], "mean_interval": None}, {"alpha": 0.05})
-    {'task': 'a', 'rank': 1, 'rank_worst': 3, 'entry': 'b', 'mean_low': None, 'mean_high': None, 'alpha': 0.05}
-    """
-    flat: dict[str, object] = {**first, "rank": None, "rank_worst": None}
-    for name, value in values.items():
-        if name == "ranks" or name.endswith("interval"):
-            stem = name.removesuffix("_interval")
-            ends = ("rank", "rank_worst") if name == "ranks" else (f"{stem}_low", f"{stem}_high")
-            flat |= dict(zip(ends, value or (None, None)))
-        else:
-            flat[name] = value
-    return flat | dict(last)
 
 
 def _harmless(value: object) -> object:

@@ -1,6 +1,9 @@
-"""Formats steps, times, sizes and counts for tables, pictures and messages."""
+"""Formats steps, differences, p, times, sizes and counts for tables, pictures and messages."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
 
 
 def steps_text(steps: float, position: object = None, digits: int = 4) -> str:
@@ -27,6 +30,43 @@ def steps_text(steps: float, position: object = None, digits: int = 4) -> str:
 def hours_text(hours: float) -> str:
     """Write core-hours with two digits, large numbers as whole ones: 0.044, 1.2, 1,234."""
     return f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
+
+
+def share_text(share: float) -> str:
+    """Write a share in percent, with a digit more below ten: 12%, 3.4%."""
+    return f"{100 * share:.{0 if abs(100 * share) >= 9.95 else 1}f}%"
+
+
+def percent(share: float) -> str:
+    """Write a difference in percent, with its sign: +12%, -3.4%; an infinite one is +inf or -100%."""
+    if math.isinf(share):
+        return "+inf" if share > 0 else "-100%"
+    text = share_text(share)
+    return text if text[0] == "-" else f"+{text}"
+
+
+def p_text(p: float) -> str:
+    """Write a p value with two digits: .021, .0004, <.0001; nothing where there is none."""
+    if math.isnan(p):
+        return ""
+    if p < 1e-4:
+        return "<.0001"
+    return f"{p:.2g}".replace("0.", ".") if p >= 0.001 else f"{p:.4f}".replace("0.", ".")
+
+
+def score_text(score: float) -> str:
+    """Write a score: 0.712."""
+    return f"{round(score, 3) + 0.0:.3f}"  # no -0.000
+
+
+def interval_text(write: Callable[[float], str], value: float, low: float, high: float) -> str:
+    """Write a number with its interval: 64k (52k to 200k)."""
+    return f"{write(value)} ({write(low)} to {write(high)})"
+
+
+def mean_text(steps: float) -> str:
+    """Write a mean of steps: with three digits, since its interval is wider than a fourth could say."""
+    return steps_text(steps, digits=3)
 
 
 def duration(seconds: float) -> str:

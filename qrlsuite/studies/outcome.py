@@ -18,7 +18,15 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.text import counted, hours_range, hours_text, steps_text
+from qrlsuite.results.text import (
+    counted,
+    hours_range,
+    hours_text,
+    interval_text,
+    mean_text,
+    p_text,
+    percent,
+)
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.planning import runs_at_difference
 from qrlsuite.statistics.sequential import Decided, PairDecision
@@ -343,11 +351,6 @@ def versus(pair: PairDecision) -> str:
     return f"{pair.first} / {pair.second}"
 
 
-def percent(value: float) -> str:
-    """Write a difference: `+12%`."""
-    return f"{100 * value:+.0f}%" if abs(value) < 100 else ("+inf" if value > 0 else "-100%")
-
-
 def difference_text(pair: PairDecision, grid: Grid) -> tuple[str, str]:
     """Return a pair's difference and its interval as text; empty where there is none.
 
@@ -403,7 +406,7 @@ def _sheet(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[st
             outcome.verdict(pair),
             str(pair.n_runs),
             *difference_text(pair, outcome.study.grid),
-            f"{pair.p[-1]:.2g}" if pair.p else "",
+            p_text(pair.p[-1]) if pair.p else "",
             needs_text(outcome, facts["needs"]),
         ]
         for pair, facts in pairs
@@ -419,8 +422,7 @@ def _entries_sheet(entries: Sequence[Mapping[str, Any]], before: str) -> Sheet:
     for facts in entries:
         time = ""
         if facts["mean_time"] is not None:
-            low, high = map(steps_text, facts["mean_time_interval"])
-            time = f"{steps_text(facts['mean_time'])} ({low} to {high})"
+            time = interval_text(mean_text, facts["mean_time"], *facts["mean_time_interval"])
         rows.append((facts["name"], str(facts["seeds"]), time, hours_text(facts["core_hours"])))
     heads = ("entry", "seeds", f"steps {before} threshold (95%)", "core-hours")
     return Sheet.of("", heads, rows, words=("entry",))

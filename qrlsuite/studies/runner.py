@@ -21,7 +21,7 @@ from qrlsuite.engine.work import EngineOutcome, Missing
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
-from qrlsuite.results.text import counted, duration, duration_range, hours_range
+from qrlsuite.results.text import counted, duration, duration_range, hours_range, hours_text
 from qrlsuite.statistics.sequential import Decision
 from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome, versus
@@ -149,7 +149,9 @@ class Overview(Shown):
                 "mean time below threshold at an error of 5%"
             )
         if file.core_hours is not None:
-            yield Text(f"the paper's software needed about {file.core_hours:,.0f} core-hours for all of it")
+            yield Text(
+                f"the paper's software needed about {hours_text(file.core_hours)} core-hours for all of it"
+            )
         yield Text(f"pictures: {', '.join(f'{p.name} ({p.kind})' for p in file.pictures)}")
 
     def _sheet(self) -> Sheet:

@@ -18,10 +18,11 @@ from rich.text import Text
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed
+from qrlsuite.results.text import interval_text, p_text, percent
 from qrlsuite.statistics import MeanRatio, mean_ratio, times_below
 from qrlsuite.statistics.grid import IntArray
 from qrlsuite.statistics.times_board import holm
-from qrlsuite.studies.outcome import StudyOutcome, by_question, percent
+from qrlsuite.studies.outcome import StudyOutcome, by_question
 
 ALPHA = 0.05
 """Probability of any false difference, over all pairs."""
@@ -211,8 +212,8 @@ class StudiesTogether(Shown):
             (
                 f"{pair.first} / {pair.second}",
                 pair.verdict,
-                f"{percent(pair.ratio.difference)} ({_span(pair.ratio.interval)})",
-                "< .0001" if pair.p < 1e-4 else f"{pair.p:.2g}",
+                interval_text(percent, pair.ratio.difference, *pair.ratio.interval),
+                p_text(pair.p),
                 _span(pair.ratio.left_out),
                 *map(percent, pair.ratio.differences),
             )

@@ -89,7 +89,7 @@ def test_a_table_is_a_data_frame(small: EntryResults) -> None:
 def test_a_board_ranks_what_it_is_given(small: EntryResults, large: EntryResults) -> None:
     board = api.board("beam6g", entries=[large, "mlp width=16"], **WHERE)
     (section,) = board.sections
-    assert [(row.tier, row.entry.label) for row in section.rows] == [
+    assert [(row.tier, row.entry.label) for row in section.tiers] == [
         (1, "ddqn mlp width=64"),
         (2, "ddqn mlp width=16"),
     ]

@@ -45,9 +45,9 @@ def test_shares_means_and_decided_pairs_by_hand() -> None:
     assert [board.results.names[i] for i in board.order] == ["quick", "slow"]
     assert board.results.mean[list(board.order)] == pytest.approx([0.225, 0.625])
     assert board.results.interquartile_mean[list(board.order)] == pytest.approx([0.225, 0.625])
-    assert board.cells(0)[4:] == ("1.00", "slow", "-")
-    assert board.cells(1)[4:] == ("-", "-", "quick")
-    assert board.cells(0)[2].startswith("0.225 (0.2")
+    cells = board.sheet().cells
+    assert [row[4:] for row in cells] == [("1.00", "slow", "-"), ("-", "-", "quick")]
+    assert cells[0][2].startswith("0.225 (0.2")
     told = json.loads(json.dumps(board.as_dict(), allow_nan=False))
     assert [row["label"] for row in told["entries"]] == ["quick", "slow"]
     assert told["better"] == [[0, 1], [-1, 0]]

@@ -71,8 +71,8 @@ def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
 ) -> None:
     (section,) = mostly_at_the_cap.sections
     rows = [("best one", 1, False), ("poor one", None, True), ("poor two", None, True)]
-    assert [(row.entry.label, row.tier, row.not_reached) for row in section.rows] == rows
-    assert [row.outperformed_by for row in section.rows[1:]] == [("best one",)] * 2
+    assert [(row.entry.label, row.tier, row.not_reached) for row in section.tiers] == rows
+    assert [row.outperformed_by for row in section.tiers[1:]] == [("best one",)] * 2
     rows = mostly_at_the_cap.as_dict()["sections"][0]["rows"]
     assert [row["verdict"].partition(":")[0] for row in rows] == ["ranked", "not reached", "not reached"]
     text = paper(mostly_at_the_cap)
@@ -84,7 +84,7 @@ def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
 
 
 def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.Leaderboard) -> None:
-    best, one, two = (row.entry for row in mostly_at_the_cap.sections[0].rows)
+    best, one, two = (row.entry for row in mostly_at_the_cap.sections[0].tiers)
     neither = "not reached: both are at the cap in all 49 cells"
     most = "significantly fewer samples in 7 of 49 cells, significantly more in none; both at the cap in 42"
     assert compare_entries(one, two).sentence == neither
@@ -99,7 +99,7 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
     later = made.sections[0].rows[1].entry
     later.curves[:, :70] = 0.1
     made = boards.of([made.sections[0].rows[0].entry, later])
-    first, second = made.sections[0].rows
+    first, second = made.sections[0].tiers
     assert first.rests_on is None
     assert second.rests_on == steps.Support("best one", "later one", cells=7, at_cap=42, total=49)
     assert re.search(r"\| 2 \| later one \| [^|]* \| 7 of 7 \|", paper(made))
@@ -113,7 +113,7 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
 
 
 def test_the_picture_of_tiers_names_who_reached_nothing(mostly_at_the_cap: board.Leaderboard) -> None:
-    figure = tiers.draw([row.entry for row in mostly_at_the_cap.sections[0].rows])
+    figure = tiers.draw([row.entry for row in mostly_at_the_cap.sections[0].tiers])
     shown = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert [text.rpartition("   ")[2].strip() for text in shown] == ["tier 1", "not reached", ""]
 
@@ -125,7 +125,7 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     note = "settings chosen after seeing runs on protocol seeds, which may flatter"
     assert f"† {note}" in markdown(made)
     assert f"| {entries[0].label} † |" in markdown(made)
-    assert f"{note[1:]}: {entries[0].label}" in report.render(made)
+    assert f"{entries[0].label}</a> †" in report.render(made)
     rows = list(csv.DictReader(io.StringIO(csv_rows(made.flat()))))
     assert [row["tuned_on_protocol_seeds"] for row in rows] == ["True", "False"]
     assert "protocol seeds, which" not in markdown(boards.of(entries))

@@ -55,9 +55,9 @@ def test_the_cheaper_step_can_outweigh_the_fewer_steps() -> None:
     assert found.mean(first).mean * found.part == pytest.approx(30.5 * STEPS * 10, abs=found.part)
     assert found.mean(second).mean * found.part == pytest.approx(20.5 * STEPS * 20, abs=found.part)
     assert [found.rank_text(row) for row in found.rows] == ["1", "2"]
-    assert found.cells(first)[3:5] == ("10", "620k (620k to 620k)"), "31 epochs: half of them need 30"
-    assert found.cells(first)[-2:] == ("few steps", "-")
-    assert found.cells(second)[-2:] == ("-", "cheap steps")
+    cells = found.sheet().cells
+    assert cells[0][3:5] == ("10", "620k (620k to 620k)"), "31 epochs: half of them need 30"
+    assert [row[-2:] for row in cells] == [("few steps", "-"), ("-", "cheap steps")]
     (by_steps,) = boards.of([few, cheap]).sections
     assert [row.entry.label for row in by_steps.times.rows] == ["few steps", "cheap steps"]
 
@@ -68,8 +68,8 @@ def test_cheap_steps_do_not_make_an_entry_first_that_never_learns() -> None:
     assert found.budget == 100 * STEPS, "10 of 100 epochs of the one that learns"
     assert [found.mean(row).at_cap.mean() for row in found.rows] == [1, 1]
     assert [found.rank_text(row) for row in found.rows] == ["1-2", "1-2"]
-    of_never = next(row for row in found.rows if row.entry is never)
-    assert found.cells(of_never)[4] == ">= 200k (200k to 200k, at cap)"
+    (of_never,) = (row for row in found.sheet().cells if row[1] == "never")
+    assert of_never[4] == ">= 200k (200k to 200k, at cap)"
 
 
 def test_equal_prices_are_compared_at_whole_epochs() -> None:
@@ -103,17 +103,17 @@ def test_what_cannot_be_compared_has_no_rank_and_a_reason(
     assert [found.rank_text(row) for row in found.rows] == ["1", "2", "-"]
     assert problem in found.rows[2].price.problem
     assert any(line.startswith("not ranked: odd: ") and problem in line for line in found.notes())
-    assert found.row_dict(found.rows[2])["comparable"] is False
+    assert [row["comparable"] for row in found.as_dict()["rows"]] == [True, True, False]
 
 
 def test_numbers_that_cannot_be_compared_are_marked() -> None:
     found = section(learner("clock", 20, 2, clocked=True), learner("other", 20, 2), by="core-hours")
-    marked = next(row for row in found.rows if row.entry.label == "clock")
-    assert found.cells(marked)[3].startswith("~")
+    (marked,) = (row for row in found.sheet().cells if row[1] == "clock")
+    assert marked[3].startswith("~")
     assert "~ : not to be compared with the others" in found.notes()
     alone = section(learner("clock", 20, 2, clocked=True), by="core-hours")
     assert alone.compared is None
-    assert alone.row_dict(alone.rows[0])["mean_cost"] is None
+    assert alone.as_dict()["rows"][0]["mean_cost"] is None
 
 
 def test_seeds_that_cost_differently_and_seeds_without_a_record() -> None:

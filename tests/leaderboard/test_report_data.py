@@ -60,10 +60,11 @@ def test_pairs_are_those_of_the_statistics() -> None:
 
 def test_a_page_agrees_with_its_board() -> None:
     board = boards.of([*boards.graded(6), boards.entry("few", 8)])
-    rows = board.sections[0].rows
-    beats = judge(board.sections[0]).beats()
-    for place, row in enumerate(rows):
-        assert {rows[other].entry.label for other in np.flatnonzero(beats[place])} == set(row.outperforms)
+    (section,) = board.sections
+    beats, wins = judge(section).beats(), {row.entry.label: row.outperforms for row in section.tiers}
+    labels = [row.entry.label for row in section.rows]
+    for place, label in enumerate(labels):
+        assert {labels[other] for other in np.flatnonzero(beats[place])} == set(wins[label])
 
 
 def test_a_pair_speaks_from_both_sides() -> None:

@@ -37,21 +37,21 @@ def column(tab: Any, key: str, table: str = "#board-0-table") -> list[str]:
 
 def test_the_table_sorts_by_click(opened: Open, page: str) -> None:
     tab = opened(page)
-    means = [float(value) for value in column(tab, "mean")[:-1]]
+    means = [float(value) for value in column(tab, "mean_time")[:-1]]
     assert means == sorted(means)
-    assert column(tab, "mean")[-1] == "", "fewer than 20 seeds"
-    header = tab.locator("#board-0-table th[data-key=steps]")
+    assert column(tab, "mean_time")[-1] == "", "fewer than 20 seeds"
+    header = tab.locator("#board-0-table th[data-key=sample_complexity]")
     header.get_by_role("button").click()
-    up = [int(value) for value in column(tab, "steps")]
+    up = [int(value) for value in column(tab, "sample_complexity")]
     assert up == sorted(up)
     assert header.get_attribute("aria-sort") == "ascending"
     assert tab.locator("#board-0-table [aria-sort]").count() == 1
     header.get_by_role("button").click()
-    assert [int(value) for value in column(tab, "steps")] == up[::-1]
+    assert [int(value) for value in column(tab, "sample_complexity")] == up[::-1]
     assert header.get_attribute("aria-sort") == "descending"
     for reverse in (False, True):
-        tab.locator("#board-0-table th[data-key=rank] button").click()
-        ranks = column(tab, "rank")
+        tab.locator("#board-0-table th[data-key=ranks] button").click()
+        ranks = column(tab, "ranks")
         assert ranks == [*sorted(ranks[:-1], reverse=reverse), ""], "an unranked entry stays last"
 
 
@@ -307,11 +307,11 @@ def test_no_page_scrolls_sideways(opened: Open) -> None:
 def test_a_narrow_page_shows_cards_and_sorts_them(opened: Open, page: str) -> None:
     tab = opened(page, 390)
     assert not tab.locator("#board-0-table thead").is_visible()
-    tab.locator("#board-0 .only-narrow select").select_option("score")
-    scores = [float(value) for value in column(tab, "score")]
+    tab.locator("#board-0 .only-narrow select").select_option("final_score")
+    scores = [float(value) for value in column(tab, "final_score")]
     assert scores == sorted(scores, reverse=True)
     labels = tab.evaluate(
-        "[...document.querySelectorAll('#board-0-table tbody tr:first-child td:not(.rank, .steps)')]"
+        "[...document.querySelectorAll('#board-0-table tbody tr:first-child td:not(.rank, .with-bar)')]"
         ".map(cell => getComputedStyle(cell, '::before').content)"
     )
     assert '"Settings"' in labels

@@ -1,0 +1,293 @@
+"""The columns of boards by environment steps: of their ranks, of their tiers, and what is known of an entry.
+
+A new column is one more `Column` here: tables, the page, csv and JSON are made of these lists, and Arrow tables of
+`of_entry`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from qrlsuite.leaderboard.boards.ranked import learning_curves
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.text import hours_text, interval_text, mean_text, score_text, steps_text
+from qrlsuite.statistics import final_scores
+from qrlsuite.statistics.compare import TOO_FEW
+from qrlsuite.table import Column
+
+if TYPE_CHECKING:  # boards show themselves by this module
+    from qrlsuite.leaderboard.boards.steps import Row, Section, TieredRow
+
+SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
+
+
+def of_entry(score: str = "score", most: bool = True) -> tuple[Column[EntryResults], ...]:
+    """Return what is known of an entry by its curves, up to the horizon where a board cuts them.
+
+    Parameters
+    ----------
+    score, most:
+        What the task calls its score, and whether more of it is better.
+    """
+    return (
+        Column(
+            "final_score",
+            lambda entry: float(final_scores(learning_curves(entry)).mean()),
+            score_text,
+            "mean over seeds and over the last tenth of the epochs",
+            head=f"final {score}",
+            most=most,
+            type=float,
+        ),
+    )
+
+
+def estimate(
+    name: str,
+    interval: str,
+    read: Callable[[Any], Sequence[float] | None],
+    write: Callable[[float], str],
+    flat: tuple[str, ...] | None = None,
+    **more: Any,
+) -> tuple[Column[Any], Column[Any]]:
+    """Return the columns of a number and of its interval, which stands behind it in a cell.
+
+    Parameters
+    ----------
+    read:
+        Value, low and high of a row; None where it has none.
+    write:
+        Writes each of them.
+    flat:
+        What spreadsheets call low and high.
+    more:
+        Of the number's column.
+    """
+
+    def part(row: Any, places: slice) -> list[float] | None:
+        return None if (found := read(row)) is None else [float(each) for each in found[places]]
+
+    def value(row: Any) -> float | None:
+        return None if (found := part(row, slice(1))) is None else found[0]
+
+    def cell(row: Any) -> str:
+        return "-" if (found := read(row)) is None else interval_text(write, *found)
+
+    return (
+        Column(name, value, **{"cell": cell} | more),
+        Column(interval, lambda row: part(row, slice(1, None)), flat=flat),
+    )
+
+
+def names_text(names: Sequence[str]) -> str:
+    """Write names into a cell."""
+    return ", ".join(names) or "-"
+
+
+def ranks_text(ranks: Sequence[int]) -> str:
+    """Write the best and worst rank of an entry: `3`, or `3-5`."""
+    return "-".join(map(str, dict.fromkeys(ranks)))
+
+
+def names(entries: Sequence[EntryResults]) -> list[str]:
+    """Return the names of entries in a table: their labels, without the algorithm if all share it."""
+    alike = len({entry.algorithm for entry in entries}) == 1
+    return [
+        (entry.label.removeprefix(f"{entry.algorithm} ") if alike else entry.label)
+        + " †" * entry.on_protocol_seeds
+        for entry in entries
+    ]
+
+
+def _name(section: Section) -> Column[Row]:
+    entries = [row.entry for row in section.rows]
+    called = dict[Hashable, str](zip(map(id, entries), names(entries)))
+    return Column(
+        "entry", lambda row: row.entry.name, cell=lambda row: called[id(row.entry)], words=True
+    )  # fmt: skip
+
+
+def ranks(section: Section) -> list[Column[Row]]:
+    """Return the columns of a section's ranks."""
+    before, times = section.before, section.times
+    first = next((row.entry for row in section.rows if row.time.ranks is not None), None)
+
+    def never(row: Row) -> str:
+        shares = (f"{times.kind} {level}: {at:.0%}" for level, at in zip(times.levels, row.time.mean.at_cap))
+        return (
+            f"never there: {', '.join(shares)}; {steps_text(round(row.time.mean.half))} at half the horizon"
+        )
+
+    return [
+        Column(
+            "ranks",
+            lambda row: None if row.time.ranks is None else list(row.time.ranks),
+            ranks_text,
+            "1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
+            "A outperforms B if it needs significantly fewer steps at a threshold, and significantly more at none "
+            "(permutation tests, Holm's correction over all pairs of the board, filtered out or not)",
+            head="rank",
+            hover=lambda row: TOO_FEW if row.time.ranks is None else "",
+        ),
+        _name(section),
+        Column("place", lambda row: row.time.place, flat=("time_place",)),
+        Column("place_at_half", lambda row: row.time.place_at_half, flat=("time_place_at_half",)),
+        *estimate(
+            "mean_time",
+            "interval",
+            lambda row: (row.time.mean.mean, *row.time.mean.interval),
+            mean_text,
+            ("mean_time_low", "mean_time_high"),
+            meaning=f"environment steps that a run spends {before} a threshold, mean over seeds and the task's "
+            "thresholds, with its interval; a run that never reaches one counts with the horizon. The bar is solid to "
+            "the interval's lower end and shaded to its upper end",
+            head=f"steps {before} threshold ({times.level})",
+            bar=lambda row: (row.time.mean.interval[0], row.time.mean.mean, row.time.mean.interval[1]),
+            hover=never,
+        ),
+        Column("mean_time_at_half", lambda row: row.time.mean.half, flat=()),
+        Column("at_cap", lambda row: row.time.at_cap, flat=("times_at_cap",)),
+        Column("at_cap_by_threshold", lambda row: [float(at) for at in row.time.mean.at_cap], flat=()),
+        Column(
+            "",
+            lambda row: (
+                0.0 if row.entry is first else None if row.time.difference is None else row.time.difference[0]
+            ),
+            meaning=f"steps {before} threshold, against the first entry of the table",
+            head="vs. first",
+            cell=lambda row: row.time.difference_text.partition(" ")[0],
+            beside=lambda row: row.time.difference_text.partition(" ")[2],
+        ),
+        Column(
+            "difference_to_first", lambda row: None if row.time.difference is None else row.time.difference[0]
+        ),
+        Column(
+            "difference_interval",
+            lambda row: None if row.time.difference is None else list(row.time.difference[1:]),
+        ),
+        Column("told_apart_from_next", lambda row: times.told_apart_from_next(row.time), flat=()),
+        Column("few_and_unequal", lambda row: row.time.few, flat=("times_few_and_unequal",)),
+    ]
+
+
+def tiers(section: Section) -> list[Column[TieredRow]]:
+    """Return the columns of a section's tiers."""
+    return [
+        Column(
+            "tier",
+            lambda row: row.tier,
+            meaning="1 + the length of the longest chain of entries above, each of which outperforms the next",
+            cell=lambda row: (
+                str(row.tier) if row.tier is not None else "not reached" if row.not_reached else "undecided"
+            ),
+            hover=lambda row: row.reason,
+        ),
+        _name(section),
+        Column("verdict", lambda row: row.reason or "ranked"),
+        Column(
+            "",
+            lambda row: row.reference.steps,
+            meaning=_complexity(section),
+            head="sample complexity (5%-95%)",
+            cell=lambda row: row.reference.text,
+            bar=lambda row: (row.reference.low, row.reference.steps, row.reference.high),
+        ),
+        Column(
+            "rests_on",
+            lambda row: None if row.rests_on is None else asdict(row.rests_on),
+            meaning="cells of the narrowest win in the chain of wins above an entry, of the cells in which not both "
+            "are at the cap",
+            cell=lambda row: "-" if row.rests_on is None else row.rests_on.text,
+            flat=tuple(f"rests_on_{name}" for name in SUPPORT),
+            hover=lambda row: "" if row.rests_on is None else row.rests_on.sentence,
+        ),
+        Column(
+            "",
+            lambda row: row.wins,
+            meaning="grid cells with significantly fewer samples, and with more, over all other entries",
+            head="cells +/-",
+            cell=lambda row: f"{row.wins}/{row.losses}",
+        ),
+        Column("copeland", lambda row: row.copeland),
+        Column("wins", lambda row: row.wins),
+        Column("losses", lambda row: row.losses),
+        Column("outperforms", lambda row: list(row.outperforms)),
+        Column("outperformed_by", lambda row: list(row.outperformed_by)),
+    ]
+
+
+def facts(section: Section) -> list[Column[Row]]:
+    """Return the columns that ranks and tiers have in common."""
+
+    def cost(name: str) -> Column[Row]:
+        meaning = f"mean over the last tenth of the epochs, less is better; --by {name} ranks by it"
+        return Column("", lambda row: row.costs[name], "{:.3g}".format, meaning, head=name)
+
+    by_name: Column[Row] = Column(
+        "costs", lambda row: dict(row.costs), flat=tuple(f"cost_{name}" for name in section.ranking.costs)
+    )
+    return [
+        Column("label", lambda row: row.entry.label),
+        Column("external", lambda row: row.entry.external),
+        Column(
+            "sample_complexity",
+            lambda row: row.reference.steps,
+            meaning=_complexity(section),
+            cell=lambda row: ">= " * row.reference.unsettled + steps_text(row.reference.steps),
+            hover=lambda row: row.reference.text,
+        ),
+        Column("interval", lambda row: [row.reference.low, row.reference.high]),
+        Column("at_cap", lambda row: row.reference.at_cap),
+        Column("unsettled", lambda row: row.reference.unsettled),
+        *(
+            column.of(lambda row: row.cut)
+            for column in of_entry(section.score.called, section.score.sign > 0)
+        ),
+        *map(cost, section.ranking.costs),
+        *([by_name] if section.ranking.costs else []),
+        Column(
+            "seeds",
+            lambda row: len(row.entry.seeds),
+            cell=lambda row: f"{len(row.entry.seeds)}{'*' * row.provisional}{'!' * row.time.few}",
+            most=True,
+        ),
+        Column("unfinished_seeds", lambda row: len(row.entry.left_out)),
+        Column("diverged_seeds", lambda row: list(row.entry.diverged)),
+        Column("provisional", lambda row: row.provisional),
+        Column(
+            "core_hours",
+            lambda row: row.entry.hours,
+            meaning="of training",
+            head="core-hours",
+            cell=lambda row: (
+                "-" if row.entry.external and not row.entry.hours else hours_text(row.entry.hours)
+            ),
+        ),
+        Column(
+            "",
+            lambda row: sum(row.entry.parameters),
+            meaning="trained numbers of an agent; q: of a quantum circuit; fixed: those that stay as they were drawn",
+            head="parameters",
+            cell=lambda row: row.entry.parameters_text(" q"),
+        ),
+        Column(
+            "parameters",
+            lambda row: {
+                "classical": row.entry.parameters[0],
+                "quantum": row.entry.parameters[1],
+                "fixed": row.entry.fixed,
+                "networks": row.entry.networks,
+            },
+            flat=("parameters_classical", "parameters_quantum", "parameters_fixed", "networks"),
+        ),
+        Column("settings", lambda row: row.entry.settings, cell=lambda row: row.entry.settings, words=True),
+        Column("tuning", lambda row: row.entry.tuning, flat=()),
+    ]
+
+
+def _complexity(section: Section) -> str:
+    """Define the sample complexity in words."""
+    goal = "score 1 - epsilon or more" if section.times.kind == "epsilon" else "have reached a threshold"
+    return f"steps until a share delta of the seeds {goal}, here at {section.ranking.cell}"
