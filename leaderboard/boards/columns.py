@@ -24,7 +24,7 @@ SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
 
 
 def of_entry(score: str = "score", most: bool = True) -> tuple[Column[EntryResults], ...]:
-    """Return what is known of an entry by its curves, up to the horizon where a board cuts them.
+    """Return columns of an entry by its curves, which a board cuts at its horizon; the first is its final score.
 
     Parameters
     ----------
@@ -220,6 +220,7 @@ def tiers(section: Section) -> list[Column[TieredRow]]:
 
 def facts(section: Section) -> list[Column[Row]]:
     """Return the columns that ranks and tiers have in common."""
+    final, *others = of_entry(section.score.called, section.score.sign > 0)
 
     def cost(name: str) -> Column[Row]:
         meaning = f"mean over the last tenth of the epochs, less is better; --by {name} ranks by it"
@@ -241,10 +242,7 @@ def facts(section: Section) -> list[Column[Row]]:
         Column("interval", lambda row: [row.reference.low, row.reference.high]),
         Column("at_cap", lambda row: row.reference.at_cap),
         Column("unsettled", lambda row: row.reference.unsettled),
-        *(
-            column.of(lambda row: row.cut)
-            for column in of_entry(section.score.called, section.score.sign > 0)
-        ),
+        final.of(lambda row: row.cut),
         *map(cost, section.ranking.costs),
         *([by_name] if section.ranking.costs else []),
         Column(
@@ -284,6 +282,7 @@ def facts(section: Section) -> list[Column[Row]]:
         ),
         Column("settings", lambda row: row.entry.settings, cell=lambda row: row.entry.settings, words=True),
         Column("tuning", lambda row: row.entry.tuning, flat=()),
+        *(column.of(lambda row: row.cut) for column in others),
     ]
 
 

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, UnknownNameError, listed, nearest
+from qrlsuite.leaderboard.boards.columns import of_entry
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.records import MEASURED
 from qrlsuite.statistics import areas, final_scores, last_epochs
 from qrlsuite.statistics.times import times_below, times_lost
+from qrlsuite.table import flat
 
 Rows = Literal["entries", "seeds", "epochs"]
 """Kinds of rows of a table."""
@@ -121,7 +123,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     Returns
     -------
     pyarrow.Table
-        The columns are `FIELDS[rows]`, each option of an entry, and each metric of an environment (`measured.NAME`,
+        The columns are `FIELDS[rows]`, for entries those of `of_entry`, each option, and each metric (`measured.NAME`,
         averaged like the row's score); null if an entry has it not. A column of whole and other numbers is float64, a
         column of numbers and texts is text; lists are JSON.
     """
@@ -130,7 +132,8 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
         "seeds": _of_seeds,
         "epochs": _of_epochs,
     }
-    options = _option_columns(entries)
+    shared = _shared(entries) if rows == "entries" else {}
+    options = {name: values for name, (values, _) in shared.items()} | _option_columns(entries)
     metrics = sorted({name for entry in entries for name in entry.metrics})
     fields = FIELDS[rows]
     schema = pyarrow.schema(
@@ -138,7 +141,8 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
             pyarrow.field(each.name, each.type, metadata={"meaning": each.meaning, "unit": each.unit})
             for each in fields
         ]
-        + [pyarrow.field(name, column.type) for name, column in options.items()]
+        + [pyarrow.field(name, values.type, metadata=meta) for name, (values, meta) in shared.items()]
+        + [pyarrow.field(name, values.type) for name, values in options.items() if name not in shared]
         + [pyarrow.field(f"{MEASURED}.{name}", _REAL) for name in metrics]
     )
     parts = []
@@ -154,6 +158,19 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
         columns += [_metric(entry, name, rows) for name in metrics]
         parts.append(pyarrow.table(columns, schema=schema))
     return pyarrow.concat_tables(parts) if parts else schema.empty_table()
+
+
+def _shared(entries: Sequence[EntryResults]) -> dict[str, tuple[pyarrow.Array, dict[str, str]]]:
+    """Return the columns that boards have, too, with a value for each entry, and what the schema says of them."""
+    types = {float: _REAL, int: _WHOLE, str: _TEXT, bool: _TRUTH}
+    found = {}
+    for each in of_entry()[1:]:
+        rows = [flat([each], entry) for entry in entries]
+        for name in each.heads:
+            values = [row[name] for row in rows]
+            array = pyarrow.array(values, types[each.type]) if each.type else column(values)
+            found[name] = array, {"meaning": each.meaning, "unit": each.unit}
+    return found
 
 
 def _metric(entry: EntryResults, name: str, rows: Rows) -> pyarrow.Array:
