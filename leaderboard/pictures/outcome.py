@@ -12,7 +12,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import style
-from qrlsuite.results.text import percent, steps_text
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.studies import outcome as outcomes
 from qrlsuite.studies.outcome import StudyOutcome
@@ -202,7 +202,7 @@ def _ratios(axes: Axes, ends: Sequence[float], margin: float) -> None:
     axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: percent(ratio - 1) if ratio != 1 else "0"))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: f"{ratio - 1:+.0%}" if ratio != 1 else "0"))
 
 
 def _legend(axes: Axes, pairs: Sequence[PairDecision]) -> None:
