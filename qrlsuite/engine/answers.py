@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pydantic
 
 from qrlsuite import specs
@@ -145,6 +146,8 @@ def _score_problems(scores: Sequence[float], number: int, task: TaskFile) -> Ite
     episodes = task.protocol.validation_episodes
     if len(scores) != episodes:
         yield f"epoch {number} has not {episodes} scores for each seed"
+    elif max(map(abs, scores)) > np.finfo(np.float32).max:
+        yield f"a score of epoch {number} is no finite number"
     elif task.ranking.thresholds is None and not (
         min(scores) >= -_TOLERANCE and max(scores) <= 1 + _TOLERANCE
     ):

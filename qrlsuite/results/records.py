@@ -17,7 +17,6 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
 import pydantic
 from pydantic import (
     AfterValidator,
@@ -52,25 +51,16 @@ def _sorted_once(names: list[Any]) -> list[Any]:
     return names
 
 
-MOST = float(np.finfo(np.float32).max)
 Line = Annotated[str, AfterValidator(_one_line)]
 Count = Annotated[int, Field(strict=True, ge=0, lt=10**12)]
 Positive = Annotated[int, Field(strict=True, ge=1, lt=10**9)]
 Name = Annotated[str, Field(pattern=specs.WHOLE_NAME)]
-
-
-Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(strict=True, ge=0, lt=1e12)]
 
 
 class Record(pydantic.BaseModel):
-    """A JSON object of a file.
-
-    Attributes
-    ----------
-    what, cure:
-        For messages: the kind of file, and the remedy for a damaged one.
-    """
+    """A JSON object of a file; messages name its kind (`what`) and the remedy for a damaged one (`cure`)."""
 
     model_config = pydantic.ConfigDict(frozen=True, populate_by_name=True)
     what: ClassVar[str] = "a record"
@@ -165,15 +155,7 @@ class SameCodeRecord(Record):
 
 
 class EntryIdentity(Record):
-    """What an entry's hash covers.
-
-    Attributes
-    ----------
-    task:
-        The task's definition.
-    start:
-        See `qrlsuite.experiment.entry.Entry`.
-    """
+    """What an entry's hash covers: the task's definition, algorithm, model, their options, and `Entry.start`."""
 
     task: dict[str, Any]
     algorithm: str
@@ -193,18 +175,8 @@ class DeviceRecord(Record):
 class Provenance(Record):
     """Versions and machine that trained a seed, see `qrlsuite.results.provenance`; never part of an identity.
 
-    Attributes
-    ----------
-    instructions:
-        The variables by which instruction sets were fixed.
-    commit:
-        Of the suite's own working copy.
-    numerics:
-        Of the parts that are the suite's, by role.
-    before:
-        Of a published seed: with what else its earlier epochs were made.
-    host:
-        Of a remote worker.
+    `instructions` are the variables that fixed instruction sets. `before` has the other records of a published seed's
+    earlier epochs. Records of remote workers have a `host`.
     """
 
     versions: dict[str, str] = {}
@@ -246,20 +218,10 @@ def _told(imported: Any) -> Any:
 
 
 class ProbeRecord(Record):
-    """What a probe of independent seeds found (`qrlsuite.engine.probe`).
+    """The result of a probe of independent seeds (`qrlsuite.engine.probe`).
 
-    Attributes
-    ----------
-    seed, epochs:
-        The seed that was trained alone, and up to which epoch.
-    device, code:
-        The kind of device, and the digest of the code.
-    difference:
-        In what it differed.
-    reason:
-        Why nothing was probed.
-    seconds, cpu:
-        What the probe took, by the clock and of processor time.
+    `seed` was trained alone for some `epochs`, on a kind of `device`, by a `code` with this digest. `difference` names
+    the first value that differed, `reason` why nothing was probed. `seconds` are by the clock, `cpu` of processor time.
     """
 
     result: Literal["equal", "differs", "not probed"]
@@ -294,20 +256,10 @@ def _independent(probe: ProbeRecord) -> ProbeRecord:
 
 
 class PublishedRecord(Record):
-    """What a published entry says beside what was run.
+    """The facts of a published entry: numbers of `seeds` and `epochs`, `parameters` as `parameters_of` returns them.
 
-    Attributes
-    ----------
-    seeds, epochs:
-        How many.
-    parameters:
-        See `qrlsuite.results.store.parameters_of`.
-    provenance:
-        Different ones; each seed names its own.
-    diverged:
-        By seed, the first epoch after which its agent's numbers were not finite.
-    measured:
-        The metrics of the environment.
+    Each seed names one of the different provenances. `diverged` has by seed the first epoch after which its agent's
+    numbers were not finite. `measured` are metrics of the environment.
     """
 
     seeds: Positive
@@ -337,16 +289,8 @@ def _place_of_copy(place: str) -> str:
 class EntryRecord(CodedRecord):
     """What was run: enough to build the entry again anywhere.
 
-    Attributes
-    ----------
-    task_file:
-        The task as it was when the entry was first run.
-    same:
-        What its author declared about its codes.
-    plugins:
-        Where its copies of plugins by path are, by the digest of the code that they belong to.
-    imported:
-        Of curves that another program made.
+    `task_file` is the task as of the first run. `same` are its author's declarations about its codes. `plugins` has the
+    places of copied plugins by path, by the digest of their code.
     """
 
     what: ClassVar[str] = "an entry's record"
@@ -449,18 +393,9 @@ class EntryRecord(CodedRecord):
 class RunRecord(CodedRecord):
     """One seed's run: its entry, progress and provenance.
 
-    Attributes
-    ----------
-    plan:
-        Hash of the study with looks that trains it.
-    epochs:
-        Of the newest checkpoint that it was begun from while it is running, else all.
-    diverged:
-        The first epoch after which numbers of the agent were not finite.
-    imported:
-        From which file of another program.
-    agent:
-        False where it was imported without its agent.
+    `plan` is the hash of the study with looks that trains it. `epochs` counts all epochs of a finished run; of a
+    running one, the epochs that it went on from. `diverged` is the first epoch after which numbers of the agent were
+    not finite. `agent` is False if it was imported without its agent.
     """
 
     what: ClassVar[str] = "a run's record"
@@ -506,18 +441,8 @@ class RunRecord(CodedRecord):
 class EpochLine(Record):
     """One epoch of a seed. Further keys are metrics of training, and `measured.NAME` of the environment.
 
-    Attributes
-    ----------
-    scores:
-        Of the validation's episodes.
-    score:
-        Their mean, where nothing more was imported.
-    executions:
-        Circuit executions by name.
-    diverged:
-        Whether numbers of the agent were not finite after it.
-    measured:
-        Metrics of the environment by name, as tables have them.
+    `scores` are those of the validation's episodes, or `score` their mean if nothing more was imported. `executions` of
+    circuits are counted by name. `diverged`: numbers of the agent were not finite after it. Tables have `measured`.
     """
 
     model_config = pydantic.ConfigDict(extra="allow")
@@ -548,16 +473,9 @@ class EpochLine(Record):
 
 
 class TimingLine(Record):
-    """A seed's share of the time that an epoch of its group took, and where and when.
+    """A seed's share of the time that an epoch of its group of `group` seeds took, and where and when.
 
-    Attributes
-    ----------
-    train, validate:
-        Seconds by the clock.
-    cpu:
-        Core-seconds of both; None where they were not recorded, as on a GPU.
-    group:
-        Seeds that were trained together.
+    `train` and `validate` are seconds by the clock; `cpu` core-seconds of both, None if not recorded (on a GPU).
     """
 
     what: ClassVar[str] = "a record of times"

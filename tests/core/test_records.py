@@ -148,6 +148,9 @@ def test_what_older_records_lack_has_a_meaning() -> None:
     assert (run.code_identity, run.probe, run.provenance, run.parameters) == (None, None, [], {})
     assert run.agent
     assert Provenance().device.kind == "cpu"
+    assert EpochLine.read({"epoch": 1, "scores": [0.5], "loss": 1e300}, LINES).mean == 0.5, (
+        "diverging is no damage"
+    )
     with pytest.raises(
         StoreError, match="is not a run's record: missing key 'seed'; restore the file or delete"
     ):
@@ -180,3 +183,18 @@ def test_a_damaged_key_is_named(
         kind.read(content, path)
     assert str(error.value).startswith(f"{path} is not {kind.what}: ")
     assert ".".join(key) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("parameters", {"classical": -1, "quantum": 0}),
+        ("parameters", {"quantum": 1}),
+        ("provenance", []),
+        ("seeds", 0),
+    ],
+)
+def test_what_no_entry_can_have_published(name: str, value: Any) -> None:
+    content = {**ENTRY_CONTENT, "published": {**ENTRY_CONTENT["published"], name: value}}
+    with pytest.raises(StoreError, match=f"published.{name}"):
+        EntryRecord.read(content, ENTRY)
