@@ -83,7 +83,6 @@ CIRCUIT = "qubits=3 layers=1"
         *((algorithm, f"vqc-native {CIRCUIT}") for algorithm in SMALL),
         ("sac", "fourier"),
         ("sac", f"vqc-pennylane {CIRCUIT}"),
-        ("sac", f"vqc-qiskit {CIRCUIT}"),
         ("sac", f"vqc-native {CIRCUIT} linear=false critic=mlp output_rate=100"),
     ],
 )

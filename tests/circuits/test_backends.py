@@ -68,7 +68,6 @@ def test_every_ansatz_on_every_backend_agrees_with_pennylane(name, gate):
     ("backend", "options"),
     [
         ("pennylane", {"device": "lightning.qubit"}),
-        ("pennylane", {"device": "qrlsuite.native"}),
         ("qiskit", {"estimator": "aer"}),
     ],
 )
