@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
-import time
 from typing import Any
 
 import gymnasium
@@ -43,20 +41,6 @@ def scaled(net: nn.Module, factor: Any) -> nn.Module:
     return net
 
 
-def _make_closure() -> Any:
-    kept: list[Tensor] = []
-
-    def build(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-        net = Net(obs, out, generator)
-        kept.append(net.weight.detach().clone())
-        return scaled(net, 1 + kept[0].abs().mean())
-
-    return build
-
-
-closure = _make_closure()
-
-
 class ClassAttribute(Net):
     gain = 1.0
 
@@ -85,33 +69,8 @@ def build_counter(obs: int, out: int, options: Any, generator: torch.Generator) 
     return scaled(Net(obs, out, generator), 1 + 1 / next(BUILDS))
 
 
-def default_argument(
-    obs: int,
-    out: int,
-    options: Any,
-    generator: torch.Generator,
-    seen: list[Tensor] = [],  # noqa: B006
-) -> nn.Module:
-    net = Net(obs, out, generator)
-    seen.append(net.weight.detach().clone())
-    return scaled(net, 1 + seen[0].abs().mean())
-
-
-@functools.cache
-def _directions(obs: int) -> Tensor:
-    return torch.rand(obs)
-
-
-def cached_function(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return scaled(Net(obs, out, generator), 1 + _directions(obs))
-
-
 def torch_in_build(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
     return scaled(Net(obs, out, generator), torch.rand(()))
-
-
-def numpy_in_build(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return scaled(Net(obs, out, generator), np.random.rand())  # noqa: NPY002
 
 
 class TorchInForward(Net):
@@ -123,23 +82,6 @@ def torch_in_forward(obs: int, out: int, options: Any, generator: torch.Generato
     return TorchInForward(obs, out, generator)
 
 
-class NumpyInForward(Net):
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x) * (1 + np.random.rand())  # noqa: NPY002
-
-
-def numpy_in_forward(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return NumpyInForward(obs, out, generator)
-
-
-def time_in_build(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return scaled(Net(obs, out, generator), 1 + time.time_ns() % 1009 / 1009)
-
-
-def urandom_in_build(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return scaled(Net(obs, out, generator), 1 + int.from_bytes(os.urandom(4), "big") / 2**32)
-
-
 class UrandomInForward(Net):
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x) * (1 + int.from_bytes(os.urandom(4), "big") / 2**32)
@@ -147,28 +89,6 @@ class UrandomInForward(Net):
 
 def urandom_in_forward(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
     return UrandomInForward(obs, out, generator)
-
-
-class BatchNorm(Net):
-    def __init__(self, obs: int, out: int, generator: torch.Generator) -> None:
-        super().__init__(obs, out, generator)
-        self.norm = nn.BatchNorm1d(obs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(self.norm(x))
-
-
-def batch_norm(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return BatchNorm(obs, out, generator)
-
-
-class BatchMean(Net):
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x - x.mean(0))
-
-
-def batch_mean(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
-    return BatchMean(obs, out, generator)
 
 
 class RecurrentBuffer(Net):
@@ -261,8 +181,3 @@ class EnvironmentCounter(Hop):
 class NumpyInReset(Hop):
     def draw(self) -> int:
         return int(np.random.randint(3))  # noqa: NPY002
-
-
-class UrandomInReset(Hop):
-    def draw(self) -> int:
-        return os.urandom(1)[0] % 3

@@ -1,4 +1,4 @@
-"""Twenty-two plugins whose seeds are not what they are alone, or that were not: what `run` and `check` make of them."""
+"""Plugins whose seeds are not what they are alone: what `run` says of them."""
 
 from __future__ import annotations
 
@@ -33,40 +33,25 @@ def register_environments(register):
 
 PROBE, FENCE, HIDDEN = "the probe", "it moved", "is changed by a forward pass"
 
-MODELS: dict[str, tuple[str | None, set[str]]] = {
-    "good": (None, set()),
-    "closure": (PROBE, {"build order"}),
-    "class_attribute": (PROBE, {"population"}),
-    "module_global": (PROBE, {"build order"}),
-    "build_counter": (PROBE, {"same seed"}),
-    "default_argument": (PROBE, {"build order"}),
-    "cached_function": (PROBE, {"build order"}),
-    "torch_in_build": (None, set()),
-    "numpy_in_build": (None, set()),
-    "torch_in_forward": (FENCE, {"global randomness"}),
-    "numpy_in_forward": (FENCE, {"global randomness"}),
-    "time_in_build": (PROBE, {"same seed"}),
-    "urandom_in_build": (PROBE, {"same seed"}),
-    "urandom_in_forward": (PROBE, {"pure"}),
-    "batch_norm": (HIDDEN, {"shapes"}),
-    "batch_mean": (None, {"rows apart"}),
-    "recurrent_buffer": (HIDDEN, {"nothing unregistered"}),
-    "cache_by_shape": (PROBE, {"no cache"}),
-    "plain_integer": (PROBE, {"population"}),
+MODELS: dict[str, str | None] = {
+    "good": None,
+    "torch_in_build": None,
+    "class_attribute": PROBE,
+    "module_global": PROBE,
+    "build_counter": PROBE,
+    "urandom_in_forward": PROBE,
+    "cache_by_shape": PROBE,
+    "plain_integer": PROBE,
+    "torch_in_forward": FENCE,
+    "recurrent_buffer": HIDDEN,
 }
-"""By model: what `run` says of it, None where it trains; and the rules that `check` finds broken, these among them.
-
-What `build` draws from a global generator follows from the seed, so that these two are no longer bad. A mean over a
-batch mixes episodes of one seed, not seeds: `run` cannot object, and `check` does.
-"""
-
-ENVIRONMENTS: dict[str, tuple[str | None, set[str]]] = {
-    "hop": (None, set()),
-    "lanes_share_a_list": (PROBE, {"seed independence"}),
-    "environment_counter": (PROBE, {"seed independence"}),
-    "numpy_in_reset": (FENCE, {"same seed"}),
-    "urandom_in_reset": (PROBE, {"same seed"}),
+ENVIRONMENTS: dict[str, str | None] = {
+    "hop": None,
+    "lanes_share_a_list": PROBE,
+    "environment_counter": PROBE,
+    "numpy_in_reset": FENCE,
 }
+"""What `run` says of each, None where it trains: a number that `build` draws follows from the seed."""
 
 SIDES = """
 import json, sys
@@ -133,7 +118,7 @@ def verdicts(site: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 
 @pytest.mark.parametrize("name", [*MODELS, *ENVIRONMENTS])
 def test_what_run_says(name: str, verdicts: dict[str, str | None]) -> None:
-    expected, _ = {**MODELS, **ENVIRONMENTS}[name]
+    expected = {**MODELS, **ENVIRONMENTS}[name]
     said = verdicts[name]
     assert (said is None) == (expected is None), said
     if expected == PROBE:
