@@ -116,7 +116,7 @@ def test_by_name_every_rule_is_shown_and_a_broken_one_is_exit_code_1(check: Comm
     code, out, _ = check("tidy-too", "slots=0")
     assert code == 1
     assert "  ✗ workers: workers(None) returned 0, and must return how many groups" in out
-    assert out.splitlines()[-1].startswith("1 of 10 rules broken; some are tried only where")
+    assert out.splitlines()[-1].startswith("1 of 10 rules broken; some are tried only after")
     code, out, _ = check("tidy-too", "slot=3")
     assert code == 1
     assert "did you mean 'slots'" in out
