@@ -18,7 +18,6 @@ from qrlsuite.leaderboard.shelf.curves import (
     BESIDE,
     DifferentCurvesError,
     EntryResults,
-    SeedResult,
     current,
     require_scores,
 )
@@ -401,32 +400,14 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         if refused:
             raise StoreError("; ".join(refused))
         return None
-    results = {run.seed: _of_run(store, run) for run in runs}
-    return EntryResults.of(record, store.path, results, mark=store.mark, refused=tuple(refused))
-
-
-def _of_run(store: EntryStore, run: SeedRun) -> SeedResult:
-    assert run.record is not None
-    probe = run.record.probe
-    if probe is not None and probe.result == probes.DIFFERS:
-        raise StoreError(
-            f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.seed} "
-            f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
-        )
-    return SeedResult(
-        store.path,
-        run.curve,
-        len(run.scores),
-        run.finished,
-        run.seconds / 3600,
-        run.executions,
-        run.clocked,
-        run.diverged,
-        run.measured,
-        run.record.parameters,
-        run.record.provenance,
-        run.record.code_identity,
-        "" if probe is None else probe.result,
+    for probe in probes.of_records(run.record for run in runs):
+        if probe.result == probes.DIFFERS:
+            raise StoreError(
+                f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.seed} "
+                f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
+            )
+    return EntryResults.of(
+        record, store.path, {run.seed: run for run in runs}, mark=store.mark, refused=tuple(refused)
     )
 
 

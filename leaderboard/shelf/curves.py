@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -23,80 +23,13 @@ from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance
-from qrlsuite.results.records import MEASURED, EntryRecord, Provenance
+from qrlsuite.results.records import MEASURED, EntryRecord, Provenance, RunRecord
 from qrlsuite.results.seeds import parse_seeds, read_seeds
+from qrlsuite.results.store import SeedRun, parameters_of
 from qrlsuite.results.text import counted, hours_text
 
 BESIDE = "-published"
 """The mark of a published entry that stands beside own runs of it."""
-
-
-@dataclass(frozen=True, eq=False)
-class SeedResult:
-    """What is known of one seed.
-
-    Attributes
-    ----------
-    folder:
-        Where it was read: the entry's folder.
-    curve:
-        (t,) float64: mean validation score of its first epochs.
-    epochs:
-        Its finished epochs, t or more.
-    finished:
-        Whether it reached the epochs that were asked for.
-    hours, executions:
-        The core-hours and circuit executions of all its epochs.
-    clocked:
-        Whether any of these hours are by the clock and not processor time; None where the record does not say.
-    diverged:
-        The first epoch after which its agent's numbers were not finite.
-    measured:
-        Metrics of the environment by name, see `qrlsuite.results.store.SeedRun.measured`.
-    parameters:
-        Numbers of its agent: `classical` and `quantum` ones that are trained, summed over `networks`; `fixed` ones.
-    made_with:
-        What made it.
-    code:
-        The identity of the code that began it; None where that was not recorded.
-    probed:
-        The result of a probe of independent seeds, empty where none was made with it.
-    published:
-        Whether it was read from a published entry, not from a results folder.
-    agent:
-        Whether its trained agent is published with it.
-    """
-
-    folder: Path
-    curve: NDArray[np.float64]
-    epochs: int
-    finished: bool = True
-    hours: float = 0.0
-    executions: int = 0
-    clocked: bool | None = None
-    diverged: int | None = None
-    measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    parameters: Mapping[str, int] = field(default_factory=dict)
-    made_with: Sequence[Provenance] = ()
-    code: CodeIdentity | None = None
-    probed: str = ""
-    published: bool = False
-    agent: bool = False
-
-    def __add__(self, other: SeedResult) -> SeedResult:
-        """Return the longer one; of equally long ones the published one."""
-        return max(
-            self, other, key=lambda seed: (len(seed.curve), seed.epochs, seed.published, str(seed.folder))
-        )
-
-    def agrees(self, other: SeedResult) -> bool:
-        """Return whether the curves are equal in the epochs that both have."""
-        shared = min(len(self.curve), len(other.curve))
-        return np.array_equal(self.curve[:shared], other.curve[:shared])
-
-    def cut(self, epochs: int) -> SeedResult:
-        """Return the seed with its first epochs alone."""
-        return self if len(self.curve) <= epochs else replace(self, curve=self.curve[:epochs])
 
 
 class DifferentCurvesError(StoreError):
@@ -119,6 +52,8 @@ class EntryResults(Shown):
         By seed, left-out ones too.
     epochs:
         T of `curves`.
+    most:
+        Epochs beyond which curves were cut; None where they were not.
     folder:
         Folder of its files; for a sum, the folder of the results with more seeds.
     mark:
@@ -133,9 +68,10 @@ class EntryResults(Shown):
 
     record: EntryRecord
     task_file: TaskFile
-    records: Mapping[int, SeedResult]
+    records: Mapping[int, SeedRun]
     epochs: int
     folder: Path
+    most: int | None = None
     mark: str = ""
     refused: tuple[str, ...] = ()
     chosen_seeds: str = ""
@@ -143,7 +79,7 @@ class EntryResults(Shown):
 
     @classmethod
     def of(
-        cls, record: EntryRecord, folder: Path, seeds: Mapping[int, SeedResult], **facts: Any
+        cls, record: EntryRecord, folder: Path, seeds: Mapping[int, SeedRun], **facts: Any
     ) -> EntryResults:
         """Return the results of an entry, cut to the epochs that half of the finished seeds or more have."""
         return cls(record, current(record), seeds, _common_length(seeds.values()), folder, **facts)
@@ -164,10 +100,13 @@ class EntryResults(Shown):
         seeds |= {
             seed: self.records[seed] + other.records[seed] for seed in self.records.keys() & other.records
         }
+        most = min((each.most for each in (self, other) if each.most is not None), default=None)
+        length = _common_length(seeds.values())
         return replace(
             max(self, other, key=lambda results: (len(results.records), str(results.folder))),
             records=dict(sorted(seeds.items())),
-            epochs=_common_length(seeds.values()),
+            epochs=length if most is None else min(length, most),
+            most=most,
             refused=tuple(sorted({*self.refused, *other.refused})),
             chosen_seeds=max(self.chosen_seeds, other.chosen_seeds),
         )
@@ -250,7 +189,7 @@ class EntryResults(Shown):
     @cached_property
     def seeds(self) -> tuple[int, ...]:
         """The N seeds with T epochs or more."""
-        return tuple(seed for seed, result in self.records.items() if len(result.curve) >= self.epochs)
+        return tuple(seed for seed, run in self.records.items() if run.epochs >= self.epochs)
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -263,10 +202,13 @@ class EntryResults(Shown):
         return np.stack([self.records[seed].curve[: self.epochs] for seed in self.seeds])
 
     @cached_property
+    def _run_records(self) -> list[RunRecord]:
+        return [run.record for run in self.records.values() if run.record is not None]
+
+    @cached_property
     def counts(self) -> Mapping[str, int]:
-        """The numbers of an agent; numbers of older versions, without `networks`, only if no seed has newer ones."""
-        counts = [result.parameters for result in self.records.values()]
-        return next((each for each in counts if "networks" in each), counts[0])
+        """The numbers of an agent, see `qrlsuite.results.store.parameters_of`."""
+        return parameters_of(self._run_records)
 
     @property
     def parameters(self) -> tuple[int, int]:
@@ -289,39 +231,40 @@ class EntryResults(Shown):
     @property
     def source(self) -> Literal["runs", "published", "runs and published"]:
         """Whether the curves were read from a results folder, from a published entry, or from both."""
-        origins = {result.published for result in self.records.values()}
+        origins = {run.published for run in self.records.values()}
         return "runs and published" if len(origins) > 1 else "published" if True in origins else "runs"
 
     @property
     def folders(self) -> list[Path]:
         """Where its seeds were read."""
-        return list(dict.fromkeys(result.folder for result in self.records.values()))
+        return list(dict.fromkeys(run.folder for run in self.records.values()))
 
     @property
     def agents(self) -> tuple[int, ...]:
         """The seeds whose trained agents are published with it; none of an entry from a results folder."""
-        return tuple(seed for seed, result in self.records.items() if result.agent)
+        runs = (run for run in self.records.values() if run.published)
+        return tuple(run.seed for run in runs if run.record is not None and run.record.agent)
 
     @property
     def hours(self) -> float:
-        """Core-hours spent on the seeds, with the left-out ones."""
-        return float(np.sum([result.hours for result in self.records.values()]))
+        """Core-hours spent on the seeds, those that were left out too."""
+        return float(np.sum([run.hours for run in self.records.values()]))
 
     @property
     def executions(self) -> int:
         """Circuit executions of these seeds in all."""
-        return sum(result.executions for result in self.records.values())
+        return sum(run.executions for run in self.records.values())
 
     @property
     def clocked(self) -> bool | None:
         """Whether any of the hours are by the clock and not processor time; None where a record does not say."""
-        clocked = {result.clocked for result in self.records.values()}
+        clocked = {run.clocked for run in self.records.values()}
         return None if None in clocked else True in clocked
 
     @cached_property
     def _made_with(self) -> list[Provenance]:
         """What made the seeds, each once."""
-        made = (made for result in self.records.values() for made in result.made_with)
+        made = (made for record in self._run_records for made in record.provenance)
         return list({id(each): each for each in made}.values())
 
     @cached_property
@@ -347,7 +290,7 @@ class EntryResults(Shown):
     @property
     def unprobed(self) -> bool:
         """Whether code of others has part in it and no probe has shown that its seeds are independent."""
-        probed = {result.probed for result in self.records.values()}
+        probed = {probe.result for probe in probes.of_records(self._run_records)}
         return probes.EQUAL not in probed and any(map(probes.third_party, self._made_with))
 
     @cached_property
@@ -362,8 +305,8 @@ class EntryResults(Shown):
 
     @cached_property
     def _codes(self) -> list[CodeIdentity | None]:
-        made_by = (result.code for result in self.records.values())
-        return list({id(code): code for code in made_by}.values())
+        code = {id(record.code): record.code_identity for record in self._run_records}
+        return list(code.values())
 
     @property
     def plugins(self) -> Mapping[str, frozenset[str]]:
@@ -376,18 +319,20 @@ class EntryResults(Shown):
 
     def reaching(self, epochs: int) -> EntryResults | None:
         """Return the entry with the seeds that have reached some epochs, itself where all have; None for none."""
-        lengths = {len(result.curve) for result in self.records.values()}
+        lengths = set(self._lengths)
         if lengths == {self.epochs}:
             return self if self.epochs >= epochs else None
-        return self._first(epochs) if max(lengths) >= epochs else None
+        return replace(self, epochs=epochs, most=epochs) if max(lengths) >= epochs else None
 
     def cut(self, epochs: int) -> EntryResults | None:
-        """Return the first epochs of every seed that has reached a number of them; None for none."""
-        return self._first(epochs) if self.longest >= epochs else None
+        """Return the first epochs of the seeds that have reached them; None for none."""
+        return replace(self, epochs=epochs, most=epochs) if self.longest >= epochs else None
 
-    def _first(self, epochs: int) -> EntryResults:
-        seeds = {seed: result.cut(epochs) for seed, result in self.records.items()}
-        return replace(self, epochs=epochs, records=seeds)
+    @property
+    def _lengths(self) -> list[int]:
+        return [
+            run.epochs if self.most is None else min(run.epochs, self.most) for run in self.records.values()
+        ]
 
     def with_seeds(self, seeds: int | str | Iterable[int]) -> EntryResults:
         """Return the entry with these seeds only, to see the results of fewer seeds.
@@ -401,7 +346,7 @@ class EntryResults(Shown):
         missing = sorted(set(wanted) - set(self.seeds))
         if missing:
             raise OptionError(f"'{self.label}' has no complete run of seed {missing[0]}")
-        return replace(self, records={seed: self.records[seed].cut(self.epochs) for seed in wanted})
+        return replace(self, records={seed: self.records[seed] for seed in wanted}, most=self.epochs)
 
     @property
     def metrics(self) -> dict[str, NDArray[np.float64]]:
@@ -504,7 +449,7 @@ class EntryResults(Shown):
     @property
     def longest(self) -> int:
         """The epochs of the longest run."""
-        return max(len(result.curve) for result in self.records.values())
+        return max(self._lengths)
 
     @property
     def mixed_versions(self) -> tuple[str, ...]:
@@ -598,10 +543,10 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _common_length(seeds: Collection[SeedResult]) -> int:
+def _common_length(seeds: Collection[SeedRun]) -> int:
     """Return the epochs that half of the finished seeds or more have; before any finished, the fewest of any seed."""
-    lengths = sorted((len(result.curve) for result in seeds if result.finished), reverse=True)
-    return lengths[(len(lengths) - 1) // 2] if lengths else min(len(result.curve) for result in seeds)
+    lengths = sorted((run.epochs for run in seeds if run.finished), reverse=True)
+    return lengths[(len(lengths) - 1) // 2] if lengths else min(run.epochs for run in seeds)
 
 
 def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:

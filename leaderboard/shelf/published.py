@@ -29,7 +29,7 @@ from qrlsuite.engine.terminal import command
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.leaderboard.shelf.curves import EntryResults, SeedResult, require_scores
+from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.notation import parse_entry
 from qrlsuite.registry import load as registered
@@ -150,27 +150,39 @@ class PublishedEntry:
 
     def entry_results(self) -> EntryResults:
         """Return the entry as a leaderboard ranks it."""
-        said, code = self.published, self.record.code_identity
-        probed = "" if said.probe is None else said.probe.result
-        seeds = {
-            seed: SeedResult(
-                self.folder,
-                self.curves[row],
-                int(self.curves.shape[1]),
-                hours=float(self.hours[row]),
-                executions=int(self.executions[row]),
-                diverged=said.diverged.get(str(seed)),
-                measured=self.metrics(row),
-                parameters=said.parameters,
-                made_with=said.provenance[self.origins[row]].with_earlier,
-                code=code,
-                probed=probed,
-                published=True,
-                agent=seed in self.agents,
-            )
-            for row, seed in enumerate(self.seeds)
-        }
-        return EntryResults.of(self.record, self.folder, seeds, chosen_seeds=self.chosen_seeds)
+        runs = {seed: self.run(row) for row, seed in enumerate(self.seeds)}
+        return EntryResults.of(self.record, self.folder, runs, chosen_seeds=self.chosen_seeds)
+
+    def run(self, row: int) -> SeedRun:
+        """Return one seed as it is read from a results folder; its `scores` are the means."""
+        seed, said = self.seeds[row], self.published
+        diverged = said.diverged.get(str(seed))
+        record = RunRecord.model_construct(
+            task=self.record.task_name,
+            task_hash=self.record.task_hash,
+            entry=self.record.name,
+            parameters=said.parameters,
+            seed=seed,
+            code=self.record.code,
+            probe=said.probe,
+            status="finished",
+            epochs=int(self.curves.shape[1]),
+            diverged=diverged,
+            agent=seed in self.agents,
+            provenance=said.provenance[self.origins[row]].with_earlier,
+        )
+        return SeedRun(
+            seed,
+            record,
+            self.curves[row][:, None],
+            3600 * float(self.hours[row]),
+            int(self.executions[row]),
+            None,
+            diverged,
+            self.metrics(row),
+            self.folder,
+            published=True,
+        )
 
     def metrics(self, row: int) -> dict[str, NDArray[np.float64]]:
         """Return the metrics of one seed's environment, (T,) by name."""
@@ -224,26 +236,14 @@ class _PublishedSeed(SeedStore):
         super().__init__(of.path, seed, of)
         self._published, self.agent = of, of.path / AGENTS
 
-    def record(self) -> RunRecord:
+    def record(self) -> RunRecord | None:
         """Return the end and the code of a seed, as in `run.json`."""
-        entry = self._published.published
-        return RunRecord(
-            task=entry.record.task_name,
-            task_hash=entry.record.task_hash,
-            entry=entry.record.name,
-            seed=self.seed,
-            code=entry.record.code,
-            status="finished",
-            epochs=entry.published.epochs,
-        )
+        return self.read().record
 
     def read(self) -> SeedRun:
         """Return the seed's curve, hours and executions."""
         entry = self._published.published
-        row = entry.seeds.index(self.seed)
-        seconds, executions = 3600 * float(entry.hours[row]), int(entry.executions[row])
-        scores, measured = entry.curves[row][:, None], entry.metrics(row)
-        return SeedRun(self.seed, self.record(), scores, seconds, executions, measured=measured)
+        return entry.run(entry.seeds.index(self.seed))
 
     def parameters(self) -> Arrays:
         """Return the trained agent's parameters by name."""

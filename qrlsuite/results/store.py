@@ -221,9 +221,9 @@ def round_means(means: NDArray[np.float64]) -> NDArray[np.float64]:
     return settled(means)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeedRun:
-    """The content of one seed's run so far.
+    """The content of one seed's run so far, from a results folder or published. Runs of one seed add.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ class SeedRun:
     seconds:
         Core-seconds spent on the run, see `SeedStore.seconds`.
     clocked:
-        Whether some of these seconds are by the clock, which other work on the cores stretches.
+        Whether some of these seconds are by the clock, which other work on the cores stretches; None if not recorded.
     executions:
         Circuit executions of training, gradients and validation together. A circuit that is sampled with many shots
         is executed once.
@@ -243,6 +243,10 @@ class SeedRun:
     measured:
         Metrics of the environment by name: means over each epoch's validation episodes, (T,); NaN where it measured
         none.
+    folder:
+        The entry's folder.
+    published:
+        Whether it was read from a published entry.
     """
 
     seed: int
@@ -250,16 +254,37 @@ class SeedRun:
     scores: NDArray[np.float32 | np.float64]
     seconds: float
     executions: int
-    clocked: bool = False
+    clocked: bool | None = False
     diverged: int | None = None
     measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    folder: Path = Path()
+    published: bool = False
+
+    def __add__(self, other: SeedRun) -> SeedRun:
+        """Return the longer run; of two equally long runs the published one."""
+        return max(self, other, key=lambda run: (run.epochs, run.published, str(run.folder)))
+
+    def agrees(self, other: SeedRun) -> bool:
+        """Return whether the curves are equal in the epochs that both have."""
+        shared = min(self.epochs, other.epochs)
+        return np.array_equal(self.curve[:shared], other.curve[:shared])
+
+    @property
+    def epochs(self) -> int:
+        """The finished epochs T."""
+        return len(self.scores)
+
+    @property
+    def hours(self) -> float:
+        """Core-hours spent on the run."""
+        return self.seconds / 3600
 
     @property
     def finished(self) -> bool:
         """Whether the run reached the epochs that were asked for."""
         return self.record is not None and self.record.finished
 
-    @property
+    @functools.cached_property
     def curve(self) -> NDArray[np.float64]:
         """The learning curve V_1..V_T (T,): the mean score of every epoch's validation, see `learning_curve`."""
         return learning_curve(self.scores)
@@ -419,7 +444,7 @@ class SeedStore:
                 measured[inner] = _metric(inner, columns[name], self.path)
         diverged = columns["diverged"].to_pylist() if "diverged" in columns.column_names else []
         first = diverged.index(True) + 1 if True in diverged else None
-        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured)
+        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured, self.path.parent)
 
     def _columns(self) -> pyarrow.Table:
         """Return all epochs as columns: of the table, with newer lines behind them."""

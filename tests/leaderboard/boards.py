@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,14 @@ from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.leaderboard.boards import board
-from qrlsuite.leaderboard.shelf.curves import EntryResults, SeedResult
-from qrlsuite.results.records import EntryIdentity, EntryRecord
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.records import CodeRecord, EntryIdentity, EntryRecord, RunRecord
+from qrlsuite.results.store import SeedRun
 from tests.commands import say
 
 Floats = NDArray[np.float64]
+RUN = ("parameters", "provenance", "code", "probe", "agent")
+"""Facts of the records of runs."""
 HOSTILE = (
     "<script>alert(1)</script>",
     '"><img src=x onerror="document.title=1">',
@@ -48,12 +51,14 @@ def entry(
         task_file=file,
         identity=identity_of({"algorithm": "ddqn", "model": label.split()[0], **identity}),
     )
-    parameters = {"classical": 387, "quantum": quantum}
-    results = {
-        seed: SeedResult(Path(label), curve, epochs, hours=0.25 / seeds, parameters=parameters)
+    run = RunRecord.model_construct(
+        parameters={"classical": 387, "quantum": quantum}, status="finished", epochs=epochs
+    )
+    runs = {
+        seed: SeedRun(seed, run, curve[:, None], 900 / seeds, 0, None, folder=Path(label))
         for seed, curve in enumerate(curves)
     }
-    return EntryResults.of(record, Path(label), results)
+    return EntryResults.of(record, Path(label), runs)
 
 
 def identity_of(content: Mapping[str, Any]) -> EntryIdentity:
@@ -61,29 +66,31 @@ def identity_of(content: Mapping[str, Any]) -> EntryIdentity:
 
 
 def changed(entry: EntryResults, *, curves: Floats | None = None, **facts: Any) -> EntryResults:
-    """The entry with other facts, whether its record, its seeds or itself have them; with other curves (N, T)."""
-    tables: dict[type, dict[str, Any]] = {SeedResult: {}, EntryRecord: {}, EntryResults: {}}
+    """The entry with other facts, of its seeds' runs or records, or of its own record; with other curves (N, T)."""
+    tables: dict[type, dict[str, Any]] = {SeedRun: {}, RunRecord: {}, EntryRecord: {}}
+    names = {SeedRun: SeedRun.__dataclass_fields__, RunRecord: RUN, EntryRecord: EntryRecord.model_fields}
     for name, value in facts.items():
-        tables[next(table for table in tables if name in _fields(table))][name] = value
+        tables[next(table for table in tables if name in names[table])][name] = value
     if "tuning" in facts:
         tables[EntryRecord]["tuning"] = EntryTuning.model_validate(facts["tuning"])
+    if facts.get("code") is not None:
+        tables[RunRecord]["code"] = CodeRecord.model_validate(facts["code"].record())
     if "identity" in facts:
         own = {"algorithm": entry.algorithm, "model": entry.model}
         tables[EntryRecord]["identity"] = identity_of({**own, **facts["identity"]})
-    results = {seed: replace(result, **tables[SeedResult]) for seed, result in entry.records.items()}
+    usual = next(iter(entry.records.values()))
+    scores = {seed: run.scores for seed, run in entry.records.items()}
     if curves is not None:
-        usual = next(iter(results.values()))
-        results = {
-            seed: replace(results.get(seed, usual), curve=curve, epochs=len(curve))
-            for seed, curve in enumerate(curves)
-        }
-        tables[EntryResults]["epochs"] = curves.shape[1]
+        scores = dict(enumerate(curves[:, :, None]))
+    runs = {}
+    for seed, values in scores.items():
+        run = entry.records.get(seed, usual)
+        assert run.record is not None
+        record = run.record.model_copy(update=tables[RunRecord])
+        runs[seed] = replace(run, **{"seed": seed, "record": record, "scores": values, **tables[SeedRun]})
+    epochs = entry.epochs if curves is None else curves.shape[1]
     record = entry.record.model_copy(update=tables[EntryRecord])
-    return replace(entry, **{"record": record, "records": results, **tables[EntryResults]})
-
-
-def _fields(table: type) -> Collection[str]:
-    return EntryRecord.model_fields if table is EntryRecord else [field.name for field in fields(table)]
+    return replace(entry, record=record, records=runs, epochs=epochs)
 
 
 def of(entries: Sequence[EntryResults], refused: Sequence[str] = ()) -> board.Leaderboard:

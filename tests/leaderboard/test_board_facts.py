@@ -177,7 +177,7 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
 def test_devices_that_mix_within_an_entry_are_named() -> None:
     one, two = boards.graded(2)
     cpu, cuda = (Provenance(device=DeviceRecord(kind=kind)) for kind in ("cpu", "cuda"))
-    made = boards.of([boards.changed(one, made_with=[cpu, cuda]), boards.changed(two, made_with=[cpu])])
+    made = boards.of([boards.changed(one, provenance=[cpu, cuda]), boards.changed(two, provenance=[cpu])])
     note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
     assert note in markdown(made).split("  \n")
     assert "several kinds of device" not in markdown(boards.of([one, two]))

@@ -17,7 +17,7 @@ from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.leaderboard.boards import board, ranked
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
-from qrlsuite.leaderboard.shelf.curves import DifferentCurvesError, EntryResults, SeedResult
+from qrlsuite.leaderboard.shelf.curves import DifferentCurvesError, EntryResults
 from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from tests.commands import say
@@ -175,6 +175,7 @@ def test_of_entries_below_every_horizon_the_length_of_half_of_them_counts() -> N
     assert [entry.label for entry in kept] == ["mlp a"], "the others do not reach the task's horizon"
 
 
+CODE = CodeIdentity(({"role": "model", "name": "a", "distribution": "x"},))
 CURVES = np.random.default_rng(0).random((6, 5)).round(3)
 
 
@@ -184,7 +185,13 @@ def parts(draw: st.DrawFn) -> EntryResults:
     lengths = draw(st.dictionaries(st.integers(0, 5), st.integers(1, 5), min_size=1))
     entry, folder = boards.entry("mlp a", 1), Path(draw(st.sampled_from("abc")))
     results = {
-        seed: SeedResult(folder, CURVES[seed, :length], length, published=draw(st.booleans()))
+        seed: replace(
+            entry.records[0],
+            seed=seed,
+            scores=CURVES[seed, :length, None],
+            folder=folder,
+            published=draw(st.booleans()),
+        )
         for seed, length in sorted(lengths.items())
     }
     return EntryResults.of(entry.record, folder, results)
@@ -203,6 +210,9 @@ def test_results_of_an_entry_add(a: EntryResults, b: EntryResults, c: EntryResul
     assert seen(a + b) == seen(b + a)
     assert seen((a + b) + c) == seen(a + (b + c))
     assert seen(a + a) == seen(a)
+    first_epochs = [each.cut(1) for each in (a, b, a + b)]
+    assert None not in first_epochs
+    assert seen(first_epochs[0] + first_epochs[1]) == seen(first_epochs[2])
     whole = a + b
     assert list(whole.records) == sorted({*a.records, *b.records})
     for seed, result in whole.records.items():
@@ -216,7 +226,7 @@ def test_a_seed_with_two_curves_does_not_add_and_both_folders_are_named(
 ) -> None:
     assume(a.records.keys() & b.records.keys())
     here = boards.changed(a, folder=Path("here"))
-    results = {s: replace(r, curve=r.curve + 1, folder=Path("there")) for s, r in b.records.items()}
+    results = {s: replace(r, scores=r.scores + 1, folder=Path("there")) for s, r in b.records.items()}
     there = replace(b, records=results)
     for one, other in ((here, there), (there, here)):
         with pytest.raises(DifferentCurvesError, match=r"seed \d has one curve in here and another in there"):
@@ -226,8 +236,6 @@ def test_a_seed_with_two_curves_does_not_add_and_both_folders_are_named(
 def test_results_of_two_entries_do_not_add() -> None:
     with pytest.raises(OptionError, match="'mlp a' and 'mlp b' are not the same entry"):
         boards.entry("mlp a") + boards.entry("mlp b")
-    coded = boards.changed(
-        boards.entry("mlp a"), code=CodeIdentity(({"role": "model", "distribution": "x"},))
-    )
+    coded = boards.changed(boards.entry("mlp a"), code=CODE)
     with pytest.raises(OptionError, match="are not the same entry"):
         boards.entry("mlp a") + coded

@@ -15,12 +15,13 @@ from click.testing import Result
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import board, costs
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.records import Provenance
 from tests.commands import say
 from tests.leaderboard import boards
 
 STEPS = 2000
 """Environment steps of an epoch."""
-ALPHA, BETA = {"processor": "Alpha"}, {"processor": "Beta"}
+ALPHA, BETA = Provenance(processor="Alpha"), Provenance(processor="Beta")
 SHOTS = {"model_options": {"shots": 100}}
 
 
@@ -33,7 +34,7 @@ def learner(
     for run in range(seeds):
         curves[run, : epochs_below + run % 2] = 0
     executions = per_step * STEPS * epochs
-    known = {"clocked": False, "made_with": [ALPHA], "executions": executions, "hours": executions / 3600}
+    known = {"clocked": False, "provenance": [ALPHA], "executions": executions, "seconds": executions}
     return boards.changed(entry, curves=curves, **{**known, **facts})
 
 
@@ -86,12 +87,12 @@ def test_equal_prices_are_compared_at_whole_epochs() -> None:
         ({"executions": 0, "parameters": {"classical": 9}}, "executions", "executes no circuits"),
         ({"executions": 0}, "executions", "in its record: its model counts none, or"),
         ({}, "shots", "exact values, without shots"),
-        ({"hours": 0}, "core-hours", "no times in its record"),
+        ({"seconds": 0}, "core-hours", "no times in its record"),
         ({"clocked": None}, "core-hours", "does not say whether its hours are processor time"),
         ({"clocked": True}, "core-hours", "hours by the clock"),
-        ({"made_with": [ALPHA, BETA]}, "core-hours", "made on Alpha, Beta"),
-        ({"made_with": []}, "core-hours", "its processor is not recorded"),
-        ({"made_with": [BETA]}, "core-hours", "made on Beta, the others on Alpha"),
+        ({"provenance": [ALPHA, BETA]}, "core-hours", "made on Alpha, Beta"),
+        ({"provenance": []}, "core-hours", "its processor is not recorded"),
+        ({"provenance": [BETA]}, "core-hours", "made on Beta, the others on Alpha"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_compared_has_no_rank_and_a_reason(

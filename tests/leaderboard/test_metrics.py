@@ -68,7 +68,9 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, EntryResults
 def turned(entry: EntryResults, shift: float) -> EntryResults:
     """Another entry, which takes `shift` steps more."""
     results = {
-        seed: replace(result, curve=result.curve + shift, measured={"late": result.measured["late"] + shift})
+        seed: replace(
+            result, scores=result.scores + shift, measured={"late": result.measured["late"] + shift}
+        )
         for seed, result in entry.records.items()
     }
     other = boards.changed(entry, name="other", label="ddqn other")

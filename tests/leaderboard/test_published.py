@@ -597,8 +597,8 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     assert compared.remarks[-1] == f"left out: {refused[0]}"
     assert not edited_between(entry, other)
     a, b, c = (CodeIdentity(({"role": "environment", "name": name, "distribution": "x"},)) for name in "abc")
-    both = (dataclasses.replace(result, code=code) for result, code in zip(entry.records.values(), (a, b)))
-    first = dataclasses.replace(entry, records=dict(enumerate(both)))
+    both = {seed: boards.changed(entry, code=code).records[seed] for seed, code in enumerate((a, b))}
+    first = dataclasses.replace(entry, records=both)
     assert not edited_between(first, boards.changed(other, code=b)), "joined by --same"
     assert "was edited between" in edited_between(first, boards.changed(other, code=c))
     train("short", range(9), 1)
