@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -115,29 +114,6 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
 
 def label(entry: Path) -> str:
     return EntryStore(entry).record().label
-
-
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM], ids=lambda sign: sign.name)
-def test_ctrl_c_saves_and_the_same_command_resumes(
-    sign: signal.Signals, task: str, tmp_path: Path, hold: Hold
-) -> None:
-    def words(runs: str) -> list[str]:
-        run = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "3", "--epochs", "8"]
-        return [*run, "--runs", str(tmp_path / runs), "--workers", "2"]
-
-    assert qrlsuite(*words("straight")).returncode == 0
-    straight = next((tmp_path / "straight" / "tiny").iterdir())
-    stopped = tmp_path / "stopped" / "tiny" / straight.name
-    process = start(*words("stopped"), env=hold.environment)
-    hold.wait(process, workers=2)
-    os.kill(process.pid, sign)
-    _, message = process.communicate(timeout=HANGS)
-    assert process.returncode == 130
-    assert "every finished epoch is saved. The same command continues" in message
-    assert not list(stopped.glob("seed-*/epochs.parquet"))
-    assert qrlsuite(*words("stopped")).returncode == 0
-    for seed in range(3):
-        assert results(straight, seed) == results(stopped, seed)
 
 
 def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: Path, hold: Hold) -> None:

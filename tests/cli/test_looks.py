@@ -615,26 +615,6 @@ def exported() -> Path:
     return Path("plans/p")
 
 
-def test_a_published_study_is_decided_by_its_curves_and_goes_on_elsewhere(exported: Path) -> None:
-    before, after = answer("show", "p.toml"), answer("show", str(exported))
-    for outcome in (before, after):
-        for key in ("next_core_hours", "core_hours_saved", "core_hours_at_most"):
-            del outcome[key]
-    assert [round(entry.pop("core_hours"), 6) for entry in before["entries"]] == [
-        round(entry.pop("core_hours"), 6) for entry in after["entries"]
-    ]
-    assert after == before
-    taken = say("import", str(exported), "--runs", "elsewhere")
-    assert taken.output.count("imported seeds 10000:10005") == 2, taken.output
-    there = answer("show", "p.toml", "--runs", "elsewhere")
-    assert [pair["p"] for pair in there["pairs"]] == [pair["p"] for pair in before["pairs"]]
-    assert [there[key] for key in ("begun_at", "looks_taken")] == [before["begun_at"], before["looks_taken"]]
-    say("leaderboard", "--runs", "elsewhere", "--format", "html", "--out", "page.html")
-    assert "p: Which needs fewer steps" in Path("page.html").read_text()
-    verified = say("verify", str(exported))
-    assert "2 of 2 entries ok" in verified.output, verified.output
-
-
 def test_a_study_published_before_its_first_seed_keeps_its_file(exported: Path) -> None:
     file = exported / "plan.toml"
     file.write_text(f"# committed before the first seed\n{file.read_text()}")

@@ -30,7 +30,12 @@ from tests.conftest import TINY, Hold, install_from_source, installed
 from tests.engine.stress import children
 
 HERE = Path(__file__).parent
-NEEDS = {"dask": "distributed", "import-tensorboard": "tensorboard", "import-wandb": "wandb"}
+NEEDS = {
+    "dask": "distributed",
+    "import-tensorboard": "tensorboard",
+    "import-wandb": "wandb",
+    "slurm": "submitit",
+}
 """The package without which a journey is skipped."""
 LONG = {"slurm"}
 TIME = r"\b[\d.]+ ?(ms|s|min|h|days?|seconds?|minutes?|hours?)\b"
@@ -39,15 +44,19 @@ CHANGING = (
     (r"\bprocess \d+", "process N"),
     (r"\bhash [0-9a-f]{16}\b", "hash OF TODAY"),
     ("─{4,}", "────"),
-    (r"\b[\d.,e-]+ (to [\d.,e-]+ )?core-(hour|second|minute)s?", "N core-hours"),
+    (r"\b\d[\d.,e-]* (to [\d.,e-]+ )?core-(hour|second|minute)s?", "N core-hours"),
+    (r"core-hours \d[\d.e-]*( to [\d.e-]+)?", "core-hours N"),
+    (r"\[files .*?\]", "[FILES]"),
+    (r"\b(job|scancel) \d+", r"\1 N"),
+    (r"first --seeds 0:\d+", "first --seeds 0:N"),
     (rf"{TIME}( to {TIME})?", "TIME"),
     (r"\bwith \d+ workers?\b", "with N workers"),
     (r"\b[\d.]+ (k|M|G|T)?B\b", "N B"),
     (r"\b\d{5,}(?=%)", "N"),
 )
 """What is replaced in what is printed, and by what: times, sizes, processes."""
-PROGRESS = re.compile(r"seeds \d+/\d+  epoch |about [\d.]+ ?\w+ left")
-"""A line that is printed as often as there is time for."""
+PROGRESS = re.compile(r"seeds \d+/\d+  epoch |about [\d.]+ ?\w+ left|qrlsuite: compiling ")
+"""A line that is printed as often as there is time for, or once on a machine."""
 
 
 class Journey:
@@ -135,7 +144,9 @@ def without_hours(lines: list[str]) -> list[str]:
     for line, below in zip(lines, [*lines[1:], ""]):
         if "──" in below:
             edge = line.find("hours") + len("hours") if "hours" in line else 0
-        number = re.search(r"(?<= )[\d.]+(e-\d\d)?$", line[:edge])
+        number = (
+            re.search(r"(?<=  )[\d.]+(e-\d\d)?$", line[:edge]) if line[edge : edge + 1] in (" ", "") else None
+        )
         made.append(f"{line[: number.start()]}{'N':>{len(number[0])}}{line[edge:]}" if number else line)
     return made
 
@@ -168,6 +179,8 @@ def traveled(text: str, journey: Journey) -> str:
 def test_journey(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
+    if name == "slurm" and shutil.which("sinfo") is None:
+        pytest.skip("no SLURM here: sh tests/slurm/setup.sh")
     path = HERE / f"{name}.txt"
     before = path.read_text()
     after = traveled(before, Journey(tmp_path))

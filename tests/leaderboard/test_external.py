@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -57,50 +56,6 @@ def qrlsuite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., A
         return say(*map(str, words))
 
     return run
-
-
-def test_from_csv_to_a_verdict_and_a_picture_and_what_external_entries_cannot_do(
-    csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
-) -> None:
-    """External is said everywhere, and nothing unknown is a number."""
-    imported = qrlsuite("import", csv, "maximum=100")
-    assert "external fast lr=0.1 on external: imported seeds 0:20" in imported.output
-    assert "grid: every 1000 steps, the last score at or before" in imported.output
-    assert "scores over 100; thresholds 0.6, 0.7, 0.8, 0.9; horizon 10000 steps" in imported.output
-    compared = qrlsuite("compare", "fast", "slow")
-    assert compared.output.startswith("fast lr=0.1 needs")
-    assert "curves that other programs made" in " ".join(compared.output.split())
-    assert qrlsuite("plot", "curves").output == "wrote runs/external-curves.png\n"
-    assert (tmp_path / "runs" / "external-curves.png").stat().st_size > 10_000
-
-    board = qrlsuite("leaderboard").output
-    assert "curves that other programs made, and nobody here can train or check again: external fast" in board
-    [fast] = [line for line in board.splitlines() if "fast lr=0.1" in line and "█" in line]
-    assert fast.split()[-4:] == ["20", "-", "-", "-"]  # seeds, core-hours, parameters, settings
-    for by in ("score", "area", "core-hours"):
-        other = qrlsuite("leaderboard", "--by", by, "--explain").output
-        assert "curves that other programs made" in other, by
-    rows = json.loads(qrlsuite("leaderboard", "--format", "json").output)["sections"][0]["rows"]
-    assert [row["external"] for row in rows] == [True, True]
-    assert "external fast" in qrlsuite("runs").output
-    shown = json.loads(qrlsuite("show", "fast", "--json").output)
-    assert shown["imported"]["grid"].startswith("every 1000 steps")
-    entry = api.load("fast")
-    assert entry.external
-    assert entry.facts["made"] == "by another program"
-    assert entry.options["model"] == {"name": "fast lr=0.1", "lr": 0.1}
-    for words, message in (
-        (("export", "fast"), "can be compared, not trained, evaluated or published"),
-        (("evaluate", "fast"), "hold learning curves and no trained parameters"),
-        (("run", "external fast", "--task", "cartpole"), "can be compared, not trained"),
-    ):
-        assert message in refused(*words), words
-    needs = json.loads(qrlsuite("power", "fast", "slow", "--draws", 20, "--json").output)
-    assert "known" in needs["core_hours_basis"]
-    assert needs["needs"][0]["fixed_seeds"] <= 20
-    qrlsuite("import", csv, "maximum=100", "--task", "another")
-    scores = qrlsuite("export", "--out", "scores.npz", "--task", "external", "--task", "another")
-    assert "fast lr=0.1: 20 runs, 2 tasks" in scores.output
 
 
 def lines(points: Sequence[tuple[int, int, int]]) -> str:

@@ -20,7 +20,6 @@ from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import SeedsClaimedError, acquire
 from qrlsuite.results.seeds import plan_groups
 from qrlsuite.results.store import EntryStore, table_bytes, write_atomically
-from tests.commands import say
 from tests.conftest import TINY
 
 TUNING = {"trials": 3, "seeds": "1000000:1000004", "changed": []}
@@ -247,13 +246,3 @@ def test_wrong_folders(elsewhere: Path, tmp_path: Path) -> None:
             take(tmp_path / name, elsewhere)
     with pytest.raises(StoreError, match="itself: there is nothing to import"):
         take(elsewhere, elsewhere)
-
-
-def test_the_command(elsewhere: Path, exported: Path, tmp_path: Path) -> None:
-    words = ["import", str(exported.parents[1]), "--runs", str(tmp_path / "runs")]
-    done = say(*words)
-    assert done.exit_code == 0, done.output
-    assert "ddqn mlp width=4 depth=1 on tiny: imported seeds 0:2\n" in done.stdout
-    again = say(*words, "--json")
-    (entry,) = json.loads(again.stdout)["entries"]
-    assert (entry["seeds"], entry["known"]) == ([], [0, 1])
