@@ -128,7 +128,9 @@ def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:
 def board(task: str) -> Rows:
     """The board as `qrlsuite leaderboard` prints it."""
     [sheet] = api.board(task, published=True, runs="none").sheets()
-    heads = [column.title for column in sheet.columns if column.title not in ("core-hours", "settings")]
+    heads = [
+        column.title for column in sheet.columns if column.title not in ("core-hours", "settings", "spread")
+    ]
     return _chosen(sheet, heads)
 
 

@@ -10,10 +10,12 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import hours_text, interval_text, mean_text, score_text, steps_text
-from qrlsuite.statistics import final_scores
+from qrlsuite.statistics import final_scores, times_below
 from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.table import Column
 
@@ -41,7 +43,23 @@ def of_entry(score: str = "score", most: bool = True) -> tuple[Column[EntryResul
             most=most,
             type=float,
         ),
+        Column(
+            "spread",
+            _spread,
+            lambda ends: f"{mean_text(ends[0])} to {mean_text(ends[1])}",
+            "5th to 95th percentile, over seeds, of the steps that a seed spends before a threshold, mean over the "
+            "task's thresholds",
+            flat=("spread_low", "spread_high"),
+            unit="environment steps",
+            type=float,
+        ),
     )
+
+
+def _spread(entry: EntryResults) -> list[float]:
+    times = times_below(entry.curves, entry.task_file.ranking.grid, entry.steps_per_epoch).mean(axis=1)
+    low, high = np.percentile(times, (5, 95))
+    return [float(low), float(high)]
 
 
 def estimate(

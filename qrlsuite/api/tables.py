@@ -55,7 +55,8 @@ def table(
         (trained numbers of an agent), `parameters_quantum`, `parameters_fixed`; means over seeds:
         `steps_below_threshold` (environment steps, mean over the task's thresholds), `steps_lost` (their part after a
         threshold was first reached), `final_score` (of the last tenth of the epochs) and `area` (of all epochs), in
-        the unit of the task's scores; sums over seeds: `core_hours`, `executions` (of circuits).
+        the unit of the task's scores; `spread_low` and `spread_high`, the 5th and 95th percentile over seeds of steps
+        below threshold; sums over seeds: `core_hours`, `executions` (of circuits).
 
         Of seeds: `seed`, `epochs`, `finished`, `diverged` (the first epoch after which numbers of its agent were not
         finite), and these scores and costs of each. Seeds that are not complete have no scores.

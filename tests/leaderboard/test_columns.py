@@ -1,0 +1,76 @@
+"""A column in one list is seen in all formats: the spread between seeds, and what a plugin adds."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from qrlsuite import table
+from qrlsuite.engine.sheet import Sheet, csv_rows
+from qrlsuite.leaderboard.boards.columns import of_entry
+from qrlsuite.leaderboard.report import render
+from qrlsuite.leaderboard.shelf import fields
+from qrlsuite.table import Column
+from tests.leaderboard import boards
+from tests.leaderboard.test_times import reaching
+
+
+def everywhere(made: Any) -> dict[str, str]:
+    """A board in each format, as text."""
+    (sheet,) = made.sheets()
+    terminal = io.StringIO()
+    Console(file=terminal, width=250).print(sheet)
+    return {
+        "terminal": terminal.getvalue(),
+        "Markdown": sheet.markdown(),
+        "LaTeX": sheet.latex(),
+        "notebook": sheet.html(),
+        "page": render(made),
+    }
+
+
+def test_the_spread_between_seeds_is_in_every_format() -> None:
+    # 1 until epoch 10 + i of seed i, of 2000 steps: the 5th percentile of 10 to 29 epochs is 10.95, the 95th 28.05
+    entry = reaching("one", (1, 10), spread=20)
+    made = boards.of([entry])
+    low, high = 2000 * np.array([10.95, 28.05])
+    assert of_entry()[1].value(entry) == pytest.approx([low, high])
+    assert {name: "21.9k to 56.1k" in text for name, text in everywhere(made).items()} == dict.fromkeys(
+        everywhere(made), True
+    )
+    (row,) = json.loads(json.dumps(made.as_dict()))["sections"][0]["rows"]
+    assert row["spread"] == pytest.approx([low, high])
+    (line,) = csv.DictReader(io.StringIO(csv_rows(made.flat())))
+    assert [float(line["spread_low"]), float(line["spread_high"])] == pytest.approx([low, high])
+    (arrow,) = fields.table([entry], "entries").to_pylist()
+    assert [arrow["spread_low"], arrow["spread_high"]] == pytest.approx([low, high])
+    cut = boards.board.build([entry], horizon=40_000).as_dict()["sections"][0]["rows"][0]["spread"]
+    assert cut == pytest.approx([low, 40_000]), "the curves of a board end at its horizon"
+
+
+def test_a_made_up_column_is_written_by_every_writer() -> None:
+    rows: list[Any] = [["a|b", 0.25, 1, 2], ["c", None]]
+    columns: list[Column[Any]] = [
+        Column("name", lambda row: row[0], str, words=True),
+        Column("share", lambda row: row[1], "{:.0%}".format, "how much", head="share of it"),
+        Column("range_interval", lambda row: row[2:] or None),
+        Column("", lambda row: row[0], cell=lambda row: row[0].upper(), head="loud"),
+    ]
+    sheet = Sheet("title", tuple(columns), rows, ("a note",), explained=True)
+    assert sheet.cells == [("a|b", "25%", "A|B"), ("c", "-", "C")]
+    assert "| a\\|b | 25% | A\\|B |" in sheet.markdown()
+    assert r"a\textbar{}b & 25\% & A\textbar{}B \\" in sheet.latex()
+    assert "<td style='text-align:right'>25%</td>" in sheet.html()
+    assert sheet.remarks() == ["share of it: how much", "a note"]
+    assert table.record(columns, rows[0]) == {"name": "a|b", "share": 0.25, "range_interval": [1, 2]}
+    assert table.flat(columns, rows[1]) == {
+        "name": "c", "share": None, "range_low": None, "range_high": None,
+    }  # fmt: skip
+    assert csv_rows([table.flat(columns, row) for row in rows]).splitlines()[1:] == ["a|b,0.25,1,2", "c,,,"]
+    assert columns[1].of(lambda row: row["row"]).written({"row": rows[0]}) == "25%"
