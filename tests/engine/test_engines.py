@@ -15,7 +15,7 @@ import pytest
 from qrlsuite import registry, specs
 from qrlsuite.engine import api, local, where, worker
 from qrlsuite.engine.local import LocalEngine
-from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.options import build as build_options
 from qrlsuite.plugins.engines.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.results import checkpoint, survey
@@ -34,18 +34,6 @@ def test_engines_enter_by_the_door_of_plugins() -> None:
         where.build("lokal", {})
     with pytest.raises(OptionError, match="engine 'local' has no options, got partition"):
         where.build("local", {"partition": "x"})
-
-
-def test_an_engine_of_an_earlier_version_is_told_what_run_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    for without in (
-        {"run": lambda self, work, show: None},
-        {"connect": lambda self, workers, versions: None},
-    ):
-        monkeypatch.setattr(LocalEngine, "run", None)
-        for name, method in without.items():
-            monkeypatch.setattr(LocalEngine, name, method, raising=False)
-        with pytest.raises(PluginError, match=r"engine 'local' was written .* takes a list of works"):
-            where.build("local", {})
 
 
 def test_a_missing_package_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
