@@ -6,15 +6,18 @@ A new column is one more `Column` here: tables, the page, csv and JSON are made 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qrlsuite import registry
+from qrlsuite.errors import PluginError
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import hours_text, interval_text, mean_text, score_text, steps_text
+from qrlsuite.specs import NAME
 from qrlsuite.statistics import final_scores, times_below
 from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.table import Column
@@ -53,7 +56,57 @@ def of_entry(score: str = "score", most: bool = True) -> tuple[Column[EntryResul
             unit="environment steps",
             type=float,
         ),
+        *_of_plugins(),
     )
+
+
+def _of_plugins() -> list[Column[EntryResults]]:
+    """Return the columns of plugins; whatever goes wrong in one is an error that names its distribution."""
+    found: list[Column[EntryResults]] = []
+    for hook in registry.load().manager.hook.register_columns.get_hookimpls():
+        origin = f"of distribution '{hook.plugin_name.partition(':')[0]}'"
+        handed: list[Any] = []
+        _guarded(f"hook 'register_columns' {origin}", hook.function)(*[handed.append] * len(hook.argnames))
+        for column in handed:
+            if not isinstance(column, Column) or not NAME.fullmatch(str(column.name)):
+                raise PluginError(
+                    f"hook 'register_columns' {origin}: {column!r} is no Column with a usable name"
+                )
+            found.append(_fenced(column, f"column '{column.name}' {origin}"))
+    return found
+
+
+def _fenced(column: Column[Any], title: str) -> Column[EntryResults]:
+    parts = ("value", "text", "cell", "bar", "beside", "hover")
+    guarded: Any = {name: _guarded(title, own) for name in parts if (own := getattr(column, name))}
+
+    def plain(entry: EntryResults) -> Any:
+        value = guarded["value"](entry)
+        value = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(value, bool | int | float | str | None):
+            raise PluginError(f"{title}: {type(value).__name__} is no number, text or truth value")
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    return replace(column, flat=None, **guarded | {"value": plain})
+
+
+def _guarded(title: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def call(*arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except Exception as error:
+            raise PluginError(f"{title} fails: {registry.words(error)}") from error
+
+    return call
+
+
+def require_new(columns: Iterable[Column[Any]], taken: Iterable[str]) -> None:
+    """Refuse columns of plugins that others have the name of."""
+    names = set(taken)
+    for column in columns:
+        if names & set(column.heads):
+            raise PluginError(f"there is a column '{column.name}' already: give the plugin's another name")
+        names |= set(column.heads)
 
 
 def _spread(entry: EntryResults) -> list[float]:
@@ -247,7 +300,7 @@ def facts(section: Section) -> list[Column[Row]]:
     by_name: Column[Row] = Column(
         "costs", lambda row: dict(row.costs), flat=tuple(f"cost_{name}" for name in section.ranking.costs)
     )
-    return [
+    made: list[Column[Row]] = [
         Column("label", lambda row: row.entry.label),
         Column("external", lambda row: row.entry.external),
         Column(
@@ -300,8 +353,10 @@ def facts(section: Section) -> list[Column[Row]]:
         ),
         Column("settings", lambda row: row.entry.settings, cell=lambda row: row.entry.settings, words=True),
         Column("tuning", lambda row: row.entry.tuning, flat=()),
-        *(column.of(lambda row: row.cut) for column in others),
     ]
+    own: list[Column[Any]] = [*ranks(section), *tiers(section), *made]
+    require_new(others, {name for column in own for name in (column.name, *column.heads)})
+    return [*made, *(column.of(lambda row: row.cut) for column in others)]
 
 
 def _complexity(section: Section) -> str:

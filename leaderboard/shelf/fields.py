@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, UnknownNameError, listed, nearest
-from qrlsuite.leaderboard.boards.columns import of_entry
+from qrlsuite.leaderboard.boards.columns import of_entry, require_new
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.records import MEASURED
@@ -164,7 +164,9 @@ def _shared(entries: Sequence[EntryResults]) -> dict[str, tuple[pyarrow.Array, d
     """Return the columns that boards have, too, with a value for each entry, and what the schema says of them."""
     types = {float: _REAL, int: _WHOLE, str: _TEXT, bool: _TRUTH}
     found = {}
-    for each in of_entry()[1:]:
+    beside = of_entry()[1:]
+    require_new(beside, {field.name for field in FIELDS["entries"]})
+    for each in beside:
         rows = [flat([each], entry) for entry in entries]
         for name in each.heads:
             values = [row[name] for row in rows]

@@ -8,13 +8,17 @@ import sys
 import types
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from qrlsuite import hookspecs, registry, specs
 from qrlsuite.cli.extensions import add_commands
+from qrlsuite.table import Column
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.commands import qrlsuite
@@ -36,7 +40,8 @@ def load(name: str, code: str) -> registry.Registry:
 
 def test_every_kind_has_a_hook_and_every_hook_a_manual() -> None:
     assert EXAMPLES.keys() == hookspecs.HOOKS.keys()
-    assert {f"register_{kind}" for kind in specs.KINDS} | {"register_commands"} == hookspecs.HOOKS.keys()
+    kinds = {f"register_{kind}" for kind in specs.KINDS}
+    assert kinds | {"register_commands", "register_columns"} == hookspecs.HOOKS.keys()
 
 
 @pytest.mark.parametrize(("hook", "kind"), hookspecs.REGISTER.items())
@@ -46,6 +51,14 @@ def test_the_example_in_the_manual_works(hook: str, kind: type[specs.Spec]) -> N
     assert found.plugins[0].registered == {kind.kinds: [name]}
     line = EXAMPLES[hook].splitlines()[int(registered.place.rpartition(":")[2]) - 1]
     assert "register(" in line, "where it was registered"
+
+
+def test_the_example_of_a_column_works() -> None:
+    handed: list[Column[Any]] = []
+    load("example_columns", EXAMPLES["register_columns"]).manager.hook.register_columns(
+        register=handed.append
+    )
+    assert handed[0].written(SimpleNamespace(curves=np.array([[0.2, 0.9], [0.8, 0.5]]))) == "0.500"
 
 
 def test_the_example_of_a_command_works() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from qrlsuite.leaderboard.boards.columns import of_entry
 from qrlsuite.leaderboard.report import render
 from qrlsuite.leaderboard.shelf import fields
 from qrlsuite.table import Column
+from tests.commands import qrlsuite
 from tests.leaderboard import boards
 from tests.leaderboard.test_times import reaching
 
@@ -74,3 +76,38 @@ def test_a_made_up_column_is_written_by_every_writer() -> None:
     }  # fmt: skip
     assert csv_rows([table.flat(columns, row) for row in rows]).splitlines()[1:] == ["a|b,0.25,1,2", "c,,,"]
     assert columns[1].of(lambda row: row["row"]).written({"row": rows[0]}) == "25%"
+
+
+WORST = """
+from qrlsuite import hookimpl
+from qrlsuite.table import Column
+
+@hookimpl
+def register_columns(register):
+    register(Column("worst", lambda entry: entry.curves[:, -1].min(), "{:.3f}".format, "least last score"))
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (("", ""), ""),
+        (('"worst"', '"seeds"'), "there is a column 'seeds' already"),
+        ((".min()", ".nothing()"), "column 'worst' of distribution 'worst.py' fails: AttributeError"),
+        (('[:, -1].min()', ""), "column 'worst' of distribution 'worst.py': ndarray is no number, text or truth value"),
+        (("register(Column(", "nosuch(Column("), "hook 'register_columns' of distribution 'worst.py' fails: NameError"),
+        (('"worst"', '""'), "is no Column with a usable name"),
+    ],
+)  # fmt: skip
+def test_a_plugin_by_path_adds_a_column(tmp_path: Path, change: tuple[str, str], error: str) -> None:
+    (tmp_path / "worst.py").write_text(WORST.replace(*change))
+    words = ["leaderboard", "--published", "--task", "channel", "--plugin", "worst.py"]
+    done = qrlsuite(*words, "--format", "json", cwd=tmp_path)
+    if error:
+        assert (done.returncode, error in done.stderr, "Traceback" in done.stderr) == (2, True, False), (
+            done.stderr
+        )
+        return
+    (section,) = json.loads(done.stdout[done.stdout.index("{") :])["sections"]
+    assert all(0 <= row["worst"] <= 1 for row in section["rows"])
+    assert "| worst |" in qrlsuite(*words, "--format", "markdown", cwd=tmp_path).stdout
