@@ -89,9 +89,6 @@ PICTURES: dict[str, Picture] = {
     "diagnose-agents.png": Plot(
         "diagnose 'vqc-native qubits=6' --task beam6g --published", ("entries/beam6g/ddqn-vqc-native-*",)
     ),
-    "fields.png": Plot(
-        "plot fields x=parameters y=final_score --task beam6g --published", ("entries/beam6g/*",)
-    ),
     "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
     "report-pairs.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1000, "Who outperforms whom"),
     "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1300),
@@ -149,7 +146,6 @@ CAPTIONS = {
     "field.png": "The task: which antenna serves each place best",
     "curves.png": "Learning curves on beam6g",
     "cartpole.png": "Learning curves on CartPole",
-    "fields.png": "Any field against any other: the final score against parameters",
     "study-fig1-surface.png": "Surfaces of sample complexity",
     "study-fig6-bars.png": "Sample complexity as bars",
     "study-fig7-scaling.png": "Scaling with the size of networks and circuits",

@@ -121,8 +121,6 @@ def check(study: Study) -> None:
             )
         kind = pictures.KINDS[picture.kind]
         options.build(specs.resolve(kind.options), picture.settings, f"{location}.settings")
-        if kind.data is None and picture.entries:
-            raise OptionError(f"{location}.entries: picture '{picture.kind}' shows no entries")
         played = kind.data in PLAYED
         if (picture.evaluation is not None) != played:
             rule = "needs" if played else "takes no"
@@ -257,10 +255,7 @@ def draw(
             tuple((m.entry.task.name, m.entry.label, counts.get(name, 0)) for name, m in unique.items()),
             tuple((e.task, e.label, e.curves.shape[1]) for e in present if _steps(e) < longest),
         )
-        if kind.data is None:
-            figure = pictures.draw(picture.kind, **picture.settings)
-            drawn.append(Drawn(picture.name, picture.kind, (), figure=figure))
-        elif not entries:
+        if not entries:
             drawn.append(dataclasses.replace(head, problem=NOTHING))
         elif seeds is not None and kind.data in PLAYED:
             drawn.append(

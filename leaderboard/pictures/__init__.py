@@ -34,13 +34,12 @@ class Picture:
     module:
         The module with its dataclass of settings and its function `draw`.
     data:
-        First argument of `draw`: entries, episode values by policy, or scores of trained agents on a circuit backend;
-        None if it takes the settings alone.
+        First argument of `draw`: entries, episode values by policy, or scores of trained agents on a circuit backend.
     """
 
     summary: str
     module: str
-    data: Literal["entries", "episodes", "deployed"] | None = "entries"
+    data: Literal["entries", "episodes", "deployed"] = "entries"
 
     @property
     def options(self) -> str:
@@ -57,17 +56,12 @@ KINDS: dict[str, Picture] = {
     "bars": Picture("sample complexity per cell, with percentile whiskers", f"{_HERE}.bars"),
     "costs": Picture("sample complexity in steps, circuit executions and shots", f"{_HERE}.costs"),
     "scaling": Picture("sample complexity against width, qubits, degree, ...", f"{_HERE}.scaling"),
-    "fields": Picture("any field against any other: options, scores, costs", f"{_HERE}.fields"),
     "tiers": Picture("who outperforms whom by the paper's rule, in tiers", f"{_HERE}.tiers"),
-    "few-runs": Picture("how 5 seeds mislead: two entries, or one against itself", f"{_HERE}.few_runs"),
     "histogram": Picture(
         "episode sums against optimal and random (qrlsuite evaluate)", f"{_HERE}.histogram", data="episodes"
     ),
     "deployed": Picture(
         "scores of trained agents with shots or noise (studies)", f"{_HERE}.deployed", data="deployed"
-    ),
-    "estimator": Picture(
-        "how likely P_hat falls below delta, given P and 100 runs", f"{_HERE}.estimator", data=None
     ),
 }
 """Pictures by name."""
@@ -81,7 +75,7 @@ def draw(kind: str, entries: Sequence[EntryResults] = (), **settings: Any) -> Fi
     kind:
         A key of `KINDS`.
     entries:
-        The entries to show; empty for a picture without results.
+        The entries to show.
     settings:
         Its options by name.
     """

@@ -69,9 +69,7 @@ def compose(
     """
     spec = find(kind, written.tasks)
     results = {"--entry": entries, "--horizon": horizon, "--seeds": seeds}
-    if spec is None:
-        results["--task"] = written.tasks
-    if (spec is not None or pictures.KINDS[kind].data is None) and any(results.values()):
+    if spec is not None and any(results.values()):
         name = next(name for name, value in results.items() if value)
         raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
     if spec is not None:
@@ -83,8 +81,6 @@ def compose(
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
     if data == "deployed":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite study run deploy")
-    if data is None:
-        return Composed(pictures.draw(kind, (), **settings))
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
     selection = written.named()

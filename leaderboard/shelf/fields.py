@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,7 +17,6 @@ import pyarrow
 from numpy.typing import NDArray
 
 from qrlsuite.engine.terminal import printable
-from qrlsuite.errors import OptionError, UnknownNameError, listed, nearest
 from qrlsuite.leaderboard.boards.columns import of_entry, require_new
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -309,31 +308,3 @@ def _of_epochs(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
         "steps": epoch * entry.steps_per_epoch,
         "score": entry.curves.ravel(),
     }
-
-
-def find(name: str, names: Iterable[str]) -> str:
-    """Return the column of a name: itself, or of an option without its side, `width` for `model.width`."""
-    known = list(dict.fromkeys(names))
-    if name in known:
-        return name
-    found = [each for each in known if "." in each and each.partition(".")[2] == name]
-    if len(found) > 1:
-        raise OptionError(f"field '{name}': write {' or '.join(found)}")
-    if not found:
-        raise UnknownNameError(f"no field '{name}' here{nearest(name, known)}; fields: {listed(known, 100)}")
-    return found[0]
-
-
-def of_epochs(name: str) -> bool:
-    """Return whether a field is one that only epochs have."""
-    coarser = {each.name for each in (*FIELDS["entries"], *FIELDS["seeds"])}
-    return name in {each.name for each in FIELDS["epochs"]} - coarser
-
-
-def same(value: Any, wanted: Any) -> bool:
-    """Return whether a cell has a value that was typed."""
-    if isinstance(value, float) and isinstance(wanted, int | float) and not isinstance(wanted, bool):
-        return math.isclose(value, wanted, rel_tol=1e-9)
-    if isinstance(value, str) and not isinstance(wanted, str):
-        return value == json.dumps(wanted)
-    return bool(value == wanted) and isinstance(value, bool) == isinstance(wanted, bool)

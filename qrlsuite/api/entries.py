@@ -301,7 +301,7 @@ def plot(
     environment: Mapping[str, Any] | None = None,
     **settings: Any,
 ) -> Figure:
-    """Draw a picture of entries, of a task's environment, or of the estimator.
+    """Draw a picture of entries or of a task's environment.
 
     Entries that would cut the others to their own length are left out, unless `entries` names them. A warning names
     each entry that was left out.

@@ -228,7 +228,7 @@ PLUGIN = "def ring(qubits, layers): ...\n"
 GIVEN = {
     "tiny.toml": TINY + "[protocol.algorithm_epochs]\nppo = 30\n",
     "bar.toml": STUDY + 'kind = "bar"\n',
-    "many.toml": STUDY + 'kind = "estimator"\nsettings = { runs = "many" }\n',
+    "many.toml": STUDY + 'kind = "curves"\nsettings = { horizon = "many" }\n',
     "mixed.toml": STUDY.partition("[[")[0]
     + "".join(
         f'[[entries]]\nname = "{task}"\ntask = "{task}"\nmodel = "mlp"\nalgorithm = "ddqn"\n'
@@ -319,7 +319,6 @@ plot trajectory => did you mean 'trajectories'
 plot trajectories => add --task TASK
 plot field --task cartpole => shows tasks of beam6g; 'cartpole' is a task of cartpole
 plot histogram => drawn by: qrlsuite evaluate ENTRY
-plot estimator --task beam6g => picture 'estimator' shows no results: leave --task out
 plot bars wide => wide: write settings of the picture as NAME=VALUE
 plot bars --out x.gif => must be .png, .pdf or .svg
 tune width=4 --task tiny.toml => entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ...

@@ -154,7 +154,7 @@ def reduced(name: str, folder: Path) -> str:
     "name", [pytest.param(name, marks=[pytest.mark.long] if name in ALIKE else []) for name in EXPECTED]
 )
 def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
-    seeds = 6 if name == "few-runs" else 2  # its picture compares 5 with more
+    seeds = 2
     words = [reduced(name, tmp_path), "--seeds", str(seeds), "--epochs", "2"]
     words += ["--engine", "here", "--runs", str(tmp_path / "runs")]
     content = answer("study", "run", *words)
@@ -285,12 +285,12 @@ def test_only_keeps_words_of_labels_but_no_part_of_a_hash(widths: str) -> None:
 
 
 def test_a_picture_that_cannot_be_drawn_yet_says_why(widths: str, tmp_path: Path) -> None:
-    text = Path(widths).read_text().replace('kind = "scaling"', 'kind = "few-runs"')
-    Path(widths).write_text(text.replace('settings = { by = "width" }', ""))
+    text = Path(widths).read_text().replace('kind = "scaling"', 'kind = "bars"')
+    Path(widths).write_text(text.replace('settings = { by = "width" }', "settings = { horizon = 20000000 }"))
     words = (widths, "--seeds", "2", "mlp", "--epochs", "1")
     said = say("study", "run", *words, "--engine", "here", "--runs", str(tmp_path / "runs"))
     assert said.exit_code == 0
-    assert "no picture 'scaling': 'ddqn mlp width=16' has 2 seeds; this picture needs 6" in said.stdout
+    assert "no picture 'scaling': horizon = 20000000: 'ddqn mlp width=" in said.stdout
 
 
 def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp_path: Path) -> None:

@@ -77,7 +77,6 @@ EXPECTED = {
         for a in ("iqp", "cx", "cz")
         for g in ("rot", "xyz", "u3")
     ],
-    "estimator": [],
     "few-runs": mlps("ddqn", (32, 64)),
     "matched": mlps("ddqn", (10, 11, 12, 13, 14)) + vqcs("ddqn", (6, 7, 8, 9, 10)),
     "deploy": mlps("ddqn", (10, 16)) + vqcs("ddqn", (6, 10)),

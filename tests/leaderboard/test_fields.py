@@ -1,4 +1,4 @@
-"""Results as tables, and pictures of any of their fields."""
+"""Results as tables."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from qrlsuite import api
-from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards.ranked import learning_curves
-from qrlsuite.leaderboard.pictures.fields import draw
 from qrlsuite.leaderboard.shelf import fields
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import final_scores
@@ -130,70 +129,10 @@ def test_a_horizon_cuts_all(published: list[EntryResults]) -> None:
         api.table("runs")  # type: ignore[arg-type]
 
 
-def test_fields_are_found_by_their_names() -> None:
-    names = ["steps", "model.width", "model.lr", "algorithm.lr", "environment.steps"]
-    assert fields.find("width", names) == "model.width"
-    assert fields.find("steps", names) == "steps"
-    assert fields.find("environment.steps", names) == "environment.steps"
-    with pytest.raises(OptionError, match=r"field 'lr': write model\.lr or algorithm\.lr"):
-        fields.find("lr", names)
-    with pytest.raises(UnknownNameError, match=r"did you mean 'model\.width'"):
-        fields.find("model.widht", names)
-
-
-def points(figure: Any) -> dict[str, list[tuple[float, float]]]:
-    """Return the points of each line that connects means, by the color that it has."""
-    [axes] = figure.axes
-    lines = [line for line in axes.lines if line.get_linestyle() != "None" and len(line.get_xdata())]
-    return {line.get_color(): [(float(x), float(y)) for x, y in line.get_xydata()] for line in lines[:1]}
-
-
-def test_a_picture_shows_means_of_the_rows_at_each_value(runs: Path) -> None:
-    own = [api.load(name, runs=runs) for name in ("net width=4", "net width=8")]
-    [line] = points(draw(own, x="width", y="area")).values()
-    assert line == [(4, pytest.approx(0.3)), (8, pytest.approx(0.7))]
-    [line] = points(draw(own, x="steps", y="score", where="model=net width=8")).values()
-    assert line == [(10, pytest.approx(0.5)), (20, pytest.approx(0.7)), (30, pytest.approx(0.9))]
-    figure = draw(own, x="external", y="area")
-    assert [*points(figure).values()] == [[(0, pytest.approx(0.5))]]
-    assert "1 of 1 point from several entries" in " ".join(figure.get_supxlabel().split())
-    three = draw([*own, api.load("tree", runs=runs)], x="lr", y="area")
-    assert "without 1 entry without one of these fields" in " ".join(three.get_supxlabel().split())
-
-
-def test_lines_are_by_the_fields_asked_for(published: list[EntryResults]) -> None:
-    def legend(**by: Any) -> list[str]:
-        [found] = draw(published, x="parameters", y="final_score", **by).legends
-        return [text.get_text() for text in found.get_texts()]
-
-    assert legend() == ["mlp", "vqc-native"]
-    widths = ["ddqn, width=16", "ddqn, width=64", "ddqn, width=none"]
-    assert legend(by=["algorithm", "width"]) == widths
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"x": "wdith"}, "no field 'wdith' here"),
-        ({"y": "model"}, "y = model is 'mlp': choose a field of numbers"),
-        ({"x": "width", "where": "model=vqc-native"}, "nothing has model.width, steps_below_threshold and model=vqc"),
-        ({"where": "model"}, "where: model: write name=value"),
-        ({"by": "nothing"}, "no field 'nothing' here"),
-    ],
-)  # fmt: skip
-def test_bad_settings(settings: dict[str, Any], message: str, published: list[EntryResults]) -> None:
-    with pytest.raises((OptionError, UnknownNameError), match=message):
-        draw(published, **settings)
-
-
-def test_from_the_command_line(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
+def test_from_the_command_line(runs: Path) -> None:
     def run(*words: str) -> Any:
         return say(*words, "--runs", str(runs))
 
-    drawn = run("plot", "fields", "x=width", "y=area", "where=model=net", "--out", "a.png")
-    assert drawn.output == "wrote a.png\n"
     rows = list(csv.DictReader(io.StringIO(run("runs", "--format", "csv").stdout)))
     assert [(row["entry"], row["model.width"], row["seeds_finished"]) for row in rows] == [
         ("external net width=4 lr=1", "4", "2"),

@@ -21,7 +21,7 @@ from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.pictures import cells, few_runs, histogram
+from qrlsuite.leaderboard.pictures import cells, histogram
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Grid
 from tests.leaderboard import boards
@@ -206,26 +206,6 @@ def test_tiers_say_in_how_many_cells() -> None:
     assert "undecided: fewer than 20 seeds" in written
 
 
-def test_few_runs_of_one_entry_are_disjoint_sets_and_equally_often_ahead() -> None:
-    entry = noisy("ddqn mlp width=64", 40, 0.95)
-    drawn = few_runs._sample([entry], Grid.relative([0.2], [0.75]), 200_000, 5, 400, np.random.default_rng(0))
-    assert all(not set(a) & set(b) for a, b in zip(*(runs.tolist() for runs in drawn.runs)))
-    ahead, behind = (drawn.steps[0] < drawn.steps[1]).mean(), (drawn.steps[0] > drawn.steps[1]).mean()
-    assert abs(ahead - behind) < 0.1
-    with pytest.raises(OptionError, match="has 9 seeds; this picture needs 10"):
-        pictures.draw("few-runs", [learner(seeds=9)])
-    with pytest.raises(OptionError, match="one or two entries, not 3"):
-        pictures.draw("few-runs", [*ENTRIES, learner("ddqn mlp width=8")])
-
-
-def test_estimator_draws_the_exact_binomial() -> None:
-    axes = pictures.draw("estimator", runs=5, deltas=[0.9]).axes[0]
-    curve = next(line for line in axes.get_lines() if line.get_label() == "δ = 0.9")
-    at = int(np.argmin(np.abs(np.asarray(curve.get_xdata()) - 0.8)))
-    # of 5 runs 5 must be there: the chance that one is not
-    assert np.asarray(curve.get_ydata())[at] == pytest.approx(1 - 0.8**5)
-
-
 def test_histogram_says_means_and_numbers_of_episodes() -> None:
     figure = histogram.draw({"optimal": np.full(4, 2.0), "mlp": np.array([[1.0, 2.0], [3.0, 2.0]])})
     assert "optimal   mean 2   (4 episodes)" in texts(figure)
@@ -265,7 +245,7 @@ def test_a_curve_of_one_epoch_can_be_seen() -> None:
     assert markers == ["None", "o"]
 
 
-@pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers", "few-runs"])
+@pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers"])
 def test_entries_of_two_tasks_are_not_mixed(kind: str) -> None:
     with pytest.raises(OptionError, match="shows one task"):
         pictures.draw(kind, [learner(), learner("ddqn mlp width=8", task="other")])

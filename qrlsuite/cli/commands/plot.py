@@ -1,4 +1,4 @@
-"""`qrlsuite plot`: pictures of results, of a task's environment, and of the estimator."""
+"""`qrlsuite plot`: pictures of results and of a task's environment."""
 
 from __future__ import annotations
 
