@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.columns import Column, flat, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
@@ -33,7 +34,6 @@ from qrlsuite.statistics import (
     rliable_arrays,
 )
 from qrlsuite.statistics.grid import FloatArray
-from qrlsuite.table import Column, flat, record
 
 
 @dataclass(frozen=True, eq=False)

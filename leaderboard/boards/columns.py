@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qrlsuite import registry
+from qrlsuite.columns import Column
 from qrlsuite.errors import PluginError
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -20,7 +21,6 @@ from qrlsuite.results.text import hours_text, interval_text, mean_text, score_te
 from qrlsuite.specs import NAME
 from qrlsuite.statistics import final_scores, times_below
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.table import Column
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.boards.steps import Row, Section, TieredRow

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.columns import Column, flat, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import listed
 from qrlsuite.leaderboard.boards import tables
@@ -27,7 +28,6 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import hours_text, interval_text, mean_text
 from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.table import Column, flat, record
 
 CELLS = 1000
 """Parts of the budget at which curves are read where the epochs of entries cost differently."""

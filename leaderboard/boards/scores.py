@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qrlsuite.columns import Column, flat, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import steps, tables
@@ -27,7 +28,6 @@ from qrlsuite.statistics import (
     last_epochs,
     rank_ranges,
 )
-from qrlsuite.table import Column, flat, record
 
 OF_RUNS = {"score": final_scores, "area": areas}
 """Numbers of each run that rank entries. Metrics in a task's `[ranking] costs` rank, too, by their final value."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.columns import Column, flat, record
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection, ScoreSection, digest
 from qrlsuite.leaderboard.boards import columns
@@ -30,7 +31,6 @@ from qrlsuite.leaderboard.rules import TIMES
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, last_epochs, outperformance
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.table import Column, flat, record
 
 
 @dataclass(frozen=True)

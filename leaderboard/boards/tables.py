@@ -6,6 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from qrlsuite.columns import Column
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.boards import columns
 from qrlsuite.leaderboard.boards.ranked import ranking_of
@@ -20,7 +21,6 @@ from qrlsuite.results.text import (
 )
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.table import Column
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.boards.steps import Section

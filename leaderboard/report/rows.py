@@ -6,12 +6,12 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from qrlsuite.columns import Column
 from qrlsuite.leaderboard.boards.steps import Row
 from qrlsuite.leaderboard.boards.times import TimeRow
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.results.text import mean_text
-from qrlsuite.table import Column
 
 
 @dataclass(frozen=True)

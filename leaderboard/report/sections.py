@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.columns import Column
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.boards import columns, tables
 from qrlsuite.leaderboard.boards.pair import pair_on
@@ -26,7 +27,6 @@ from qrlsuite.leaderboard.report.winners import Winners, winners
 from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.statistics import Evidence, Grid, Outcome
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.table import Column
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow
 from numpy.typing import NDArray
 
+from qrlsuite.columns import flat
 from qrlsuite.engine.terminal import printable
 from qrlsuite.leaderboard.boards.columns import of_entry, require_new
 from qrlsuite.leaderboard.boards.ranked import learning_curves
@@ -23,7 +24,6 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.records import MEASURED
 from qrlsuite.statistics import areas, final_scores, last_epochs
 from qrlsuite.statistics.times import times_below, times_lost
-from qrlsuite.table import flat
 
 Rows = Literal["entries", "seeds", "epochs"]
 """Kinds of rows of a table."""

@@ -19,8 +19,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
+from qrlsuite.columns import Column
 from qrlsuite.engine.terminal import printable
-from qrlsuite.table import Column
 
 WIDE = 165
 """Characters per line of a table that is written into a pipe or a file."""

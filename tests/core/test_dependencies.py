@@ -20,7 +20,7 @@ FOLDERS = {
 TOP = {
     "actions", "algorithm", "cells", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization",
     "masks", "notation", "options", "own", "population", "registry", "replay", "seeding", "shortforms",
-    "specs", "table",
+    "specs", "columns",
 }  # fmt: skip
 """What a plugin or a user may import, beside `qrlsuite.api`."""
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from qrlsuite import hookspecs, registry, specs
 from qrlsuite.cli.extensions import add_commands
-from qrlsuite.table import Column
+from qrlsuite.columns import Column
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.commands import qrlsuite

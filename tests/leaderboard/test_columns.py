@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from qrlsuite import table
+from qrlsuite import columns as writers
+from qrlsuite.columns import Column
 from qrlsuite.engine.sheet import Sheet, csv_rows
 from qrlsuite.leaderboard.boards.columns import of_entry
 from qrlsuite.leaderboard.report import render
 from qrlsuite.leaderboard.shelf import fields
-from qrlsuite.table import Column
 from tests.commands import qrlsuite
 from tests.leaderboard import boards
 from tests.leaderboard.test_times import reaching
@@ -70,17 +70,17 @@ def test_a_made_up_column_is_written_by_every_writer() -> None:
     assert r"a\textbar{}b & 25\% & A\textbar{}B \\" in sheet.latex()
     assert "<td style='text-align:right'>25%</td>" in sheet.html()
     assert sheet.remarks() == ["share of it: how much", "a note"]
-    assert table.record(columns, rows[0]) == {"name": "a|b", "share": 0.25, "range_interval": [1, 2]}
-    assert table.flat(columns, rows[1]) == {
+    assert writers.record(columns, rows[0]) == {"name": "a|b", "share": 0.25, "range_interval": [1, 2]}
+    assert writers.flat(columns, rows[1]) == {
         "name": "c", "share": None, "range_low": None, "range_high": None,
     }  # fmt: skip
-    assert csv_rows([table.flat(columns, row) for row in rows]).splitlines()[1:] == ["a|b,0.25,1,2", "c,,,"]
+    assert csv_rows([writers.flat(columns, row) for row in rows]).splitlines()[1:] == ["a|b,0.25,1,2", "c,,,"]
     assert columns[1].of(lambda row: row["row"]).written({"row": rows[0]}) == "25%"
 
 
 WORST = """
 from qrlsuite import hookimpl
-from qrlsuite.table import Column
+from qrlsuite.columns import Column
 
 @hookimpl
 def register_columns(register):
