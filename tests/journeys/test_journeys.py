@@ -55,8 +55,10 @@ CHANGING = (
     (r"\b\d{5,}(?=%)", "N"),
 )
 """What is replaced in what is printed, and by what: times, sizes, processes."""
-PROGRESS = re.compile(r"seeds \d+/\d+  epoch |about [\d.]+ ?\w+ left|qrlsuite: compiling ")
-"""A line that is printed as often as there is time for, or once on a machine."""
+PROGRESS = re.compile(
+    r"seeds \d+/\d+  epoch |about [\d.]+ ?\w+ left|qrlsuite: compiling |one round of |faster: fewer "
+)
+"""A line that is printed as often as there is time for, once on a machine, or on a slow one."""
 
 
 class Journey:
