@@ -213,7 +213,7 @@ class ImportedRecord(Record):
 
 
 def _told(imported: Any) -> Any:
-    """Accept the records of `import-released`, which say nothing more."""
+    """Accept the records of 0.1, which only say that the entry was imported."""
     return {} if imported is True else imported
 
 

@@ -178,3 +178,25 @@ def test_what_is_not_used_is_not_imported() -> None:
         assert not imported("torch")
     """
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+UNPICKLERS = {
+    "pickle", "_pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal", "jsonpickle",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("module", sorted(ALL))
+def test_nothing_reads_a_pickle(module: str) -> None:
+    """Static: no unpickler is imported, and no library is asked to unpickle."""
+    for node in ast.walk(ast.parse(ALL[module].read_text())):
+        names: set[str] = set()
+        if isinstance(node, ast.Import):
+            names = {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names = {(node.module or "").partition(".")[0]}
+        elif isinstance(node, ast.keyword):
+            assert node.arg != "allow_pickle" or not getattr(node.value, "value", True)
+            assert node.arg != "weights_only"
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            assert (node.value.id, node.attr) != ("torch", "load")
+        assert not names & UNPICKLERS

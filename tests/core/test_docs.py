@@ -49,7 +49,7 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
-OF_PLUGINS = {"import-released", "rzz-cost"}
+OF_PLUGINS = {"rzz-cost"}
 """Commands on the pages that a plugin brings."""
 IN_SENTENCES = {
     (page.name, code)
