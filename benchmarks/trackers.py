@@ -14,7 +14,19 @@ import tempfile
 from pathlib import Path
 
 from qrlsuite import registry, specs
-from qrlsuite.testing.tracker import RECORD, RUN
+
+RUN = {
+    **{
+        "task": "example",
+        "task_hash": "0123456789abcdef",
+        "entry": "ddqn-mlp-01234567",
+        "label": "ddqn mlp width=64",
+    },
+    **{"algorithm": "ddqn", "algorithm_options": {"gamma": 0.95}, "model": "mlp", "family": "classical"},
+    **{"model_options": {"width": 64}, "parameters": {"classical": 4611, "quantum": 0, "networks": 1}},
+    "interactions_per_epoch": 2000,
+}
+RECORD = {"scores": [0.5, 0.75], "loss": 0.25, "train_return": None, "executions": {"forward": 12}}
 
 
 def measure(name: str, runs: int, epochs: int) -> tuple[float, float, float]:

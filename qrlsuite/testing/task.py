@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,6 @@ from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.task import Task, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
-from qrlsuite.testing.toml import check_format, check_names, in_its_words, parsed
 
 LONGEST = 20_000
 """Steps within which an episode must end."""
@@ -26,12 +27,16 @@ def check(subject: Subject) -> list[Finding]:
     spec = subject.spec
     assert isinstance(spec, specs.TaskSpec)
     rules = Checklist()
-    cause = "values are hashed as JSON, which has neither nan nor infinity"
-    task = check_format(rules, spec, parse, "valid, with an environment that exists", cause)
-    if task is None:
+    if not rules.run("file", "an absolute path, to a file that is there", lambda: _path(spec.path)):
         return rules.findings
-    elsewhere = "results would lie under another name than the command's"
-    check_names(rules, spec, task.file.name, task.file.summary, elsewhere)
+    cause = "values are hashed as JSON, which has neither nan nor infinity"
+    tasks: list[Task] = []
+    if not rules.run(
+        "format", "valid, with an environment that exists", lambda: tasks.append(_parsed(spec)), cause
+    ):
+        return rules.findings
+    task = tasks[0]
+    rules.run("says what is registered", "name and summary are the file's", lambda: _names(spec, task))
     rules.run("identity", "the same hash every time", lambda: _identity(spec, task))
     rules.run("algorithms", "the default one and those with presets exist", lambda: _algorithms(task))
     rules.run("ranking", "horizons are whole epochs, within a complete run", lambda: _ranking(task))
@@ -39,9 +44,53 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
+@contextlib.contextmanager
+def _in_its_words() -> Iterator[None]:
+    """Turn the suite's own errors into broken rules: they name the place and the remedy."""
+    try:
+        yield
+    except QrlSuiteError as error:
+        raise BrokenRuleError(str(error)) from error
+
+
+def _path(path: str) -> None:
+    """Require that the spec leads to a file, from whatever folder a command runs in."""
+    require(
+        Path(path).is_absolute(),
+        f"path = {path!r} is relative to the folder where a command runs: write str(Path(__file__).parent / ...)",
+    )
+    require(
+        Path(path).is_file(),
+        f"{path} is not there: is the TOML file among the package data, [tool.setuptools.package-data]?",
+    )
+
+
+def _parsed(spec: specs.TaskSpec) -> Task:
+    path = Path(spec.path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise BrokenRuleError(f"{path.name} is not text in UTF-8, as TOML is: {error}") from error
+    with _in_its_words():
+        return parse(text, path.name)
+
+
+def _names(spec: specs.TaskSpec, task: Task) -> None:
+    name, summary = task.file.name, task.file.summary
+    require(
+        name == spec.name,
+        f"registered as '{spec.name}', and the file says name = '{name}': results would lie under another name than "
+        "the command's",
+    )
+    require(
+        summary == spec.summary,
+        f"registered with the summary {spec.summary!r}, and the file says {summary!r}: read it from the file",
+    )
+
+
 def _identity(spec: specs.TaskSpec, task: Task) -> None:
     require(
-        parsed(spec, parse).hash == task.hash,
+        _parsed(spec).hash == task.hash,
         "read twice, the task has two hashes, under which results are kept: does an option of its environment take its "
         "default from a clock, a counter or a random number?",
     )
@@ -88,7 +137,7 @@ def _scores(task: Task) -> None:
     model = next(iter(known.of(specs.ModelSpec).values())).spec
     choose = np.random.Generator(np.random.Philox(key=9))
     ended = 0
-    with in_its_words():
+    with _in_its_words():
         envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
         envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
         envs.reset()

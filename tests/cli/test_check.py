@@ -23,24 +23,15 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from qrlsuite import hookimpl
-from qrlsuite.specs import EngineSpec, RuleSpec
+from qrlsuite.specs import EngineSpec, TaskSpec
 
 @dataclass(frozen=True)
 class Options:
-    slots: Annotated[int, Field(description="groups at a time")] = 2
+    slots: Annotated[int, Field(ge=1, description="groups at a time")] = 2
 
 class Engine:
     def __init__(self, options):
-        self.slots = options.slots
-
-    def workers(self, asked):
-        return asked or self.slots
-
-    def queued(self, store):
-        return set()
-
-    def run(self, works, show):
-        raise AssertionError("a check starts nothing")
+        raise AssertionError("a check builds no engine")
 
 @hookimpl
 def register_engines(register):
@@ -49,8 +40,8 @@ def register_engines(register):
 """
 TWICE = """
 @hookimpl
-def register_rules(register):
-    register(RuleSpec("twice", "A rule beside an engine", f"{__name__}:Engine"))
+def register_tasks(register):
+    register(TaskSpec("twice", "A task beside an engine", "missing.toml"))
 """
 
 Command = Callable[..., tuple[int, str, str]]
@@ -108,15 +99,15 @@ def test_by_name_every_rule_is_shown_and_a_broken_one_is_exit_code_1(check: Comm
     code, out, err = check("tidy-too")
     lines = out.splitlines()
     assert (code, err) == (0, "")
-    assert lines[0] == "engine 'tidy-too'"
-    assert "  ✓ queued: no seed of an entry that was never submitted waits" in lines
+    assert lines[0] == "engine 'tidy-too' (only loading and registering are checked)"
+    assert "  ✓ options: defaults are valid, frozen, and survive being stored" in lines
     assert lines[-1] == f"all {len(lines) - 2} rules hold"
     assert check("engine:tidy-too") == check("engines:tidy-too") == (code, out, err)
     assert check("tidy-too", "slots=3")[0] == 0
     code, out, _ = check("tidy-too", "slots=0")
     assert code == 1
-    assert "  ✗ workers: workers(None) returned 0, and must return how many groups" in out
-    assert out.splitlines()[-1].startswith("1 of 10 rules broken; some are tried only after")
+    assert "  ✗ options: " in out
+    assert out.splitlines()[-1].startswith("1 of 6 rules broken; some are tried only after")
     code, out, _ = check("tidy-too", "slot=3")
     assert code == 1
     assert "did you mean 'slots'" in out
@@ -124,7 +115,7 @@ def test_by_name_every_rule_is_shown_and_a_broken_one_is_exit_code_1(check: Comm
     rows = json.loads(out)
     assert (code, err) == (1, "")
     assert {(row["kind"], row["name"]) for row in rows} == {("engine", "tidy-too")}
-    assert [row["rule"] for row in rows if not row["ok"]] == ["workers"]
+    assert [row["rule"] for row in rows if not row["ok"]] == ["options"]
     assert all(row["message"] for row in rows)
 
 
@@ -196,9 +187,9 @@ def test_wrong_names_are_one_clear_line(word: str, message: str, check: Command)
 
 def test_what_the_messages_tell_to_type_works(check: Command) -> None:
     assert {row["name"] for row in json.loads(check("distribution:local", "--json")[1])} == {"elsewhere"}
-    assert check("twice", "--json")[0] == 1, "both things are the distribution's, and its rule is none"
+    assert check("twice", "--json")[0] == 1, "both things are the distribution's, and its task has no file"
     assert check("engine:twice")[0] == 0
-    assert check("rule:twice")[0] == 1
+    assert check("task:twice")[0] == 1
 
 
 def test_without_a_name_it_says_what_can_be_checked(check: Command) -> None:
@@ -214,21 +205,21 @@ CLEAN = r"\x1b[2J[bold]red[/bold]:warning: \u202e \udc9b"
 HOSTILE = f'''
 import typer
 from qrlsuite import hookimpl
-from qrlsuite.specs import EngineSpec, TrackerSpec
+from qrlsuite.specs import AnsatzSpec, TrackerSpec
 
 @hookimpl
-def register_engines(register):
-    register(EngineSpec("evil", "{DIRT}", "evil:engine"))
+def register_ansatzes(register):
+    register(AnsatzSpec("evil", "{DIRT}", "qrlsuite.plugins.circuits.ansatz:NoOptions", "evil:ansatz"))
 
 @hookimpl
 def register_trackers(register):
-    register(TrackerSpec("evil-eye", "Watches", "evil:engine"))
+    register(TrackerSpec("evil-eye", "Watches", "evil:ansatz"))
 
 @hookimpl
 def register_commands(app):
     app.command("ev\\x1bil")(lambda: None)
 
-def engine(options):
+def ansatz(*given):
     raise RuntimeError("first\\n{DIRT}")
 '''
 UNSPEAKABLE = f'''
@@ -259,7 +250,7 @@ def assert_harmless(done: subprocess.CompletedProcess[str]) -> None:
 
 
 def test_names_and_messages_of_a_hostile_plugin_control_no_terminal(hostile: Path) -> None:
-    listed = suite(hostile, "list", "engines")
+    listed = suite(hostile, "list", "ansatzes")
     assert_harmless(listed)
     assert CLEAN in listed.stdout
     assert r"[e\x1b[31mvil]" in listed.stdout
@@ -268,14 +259,15 @@ def test_names_and_messages_of_a_hostile_plugin_control_no_terminal(hostile: Pat
     assert all(line.startswith("qrlsuite: warning: plugin '") for line in warned), warned
     assert f"RuntimeError: first qrlsuite: {CLEAN}; skipped" in listed.stderr
     assert r"nobody can type the command name 'ev\x1bil'" in listed.stderr
-    for words in (["list", "plugins"], ["show", "engine", "evil"], ["--strict", "list"], ["check"]):
+    for words in (["list", "plugins"], ["show", "ansatz", "evil"], ["--strict", "list"], ["check"]):
         done = suite(hostile, *words)
         assert_harmless(done)
         assert "\\x1b" in done.stdout + done.stderr, words
         assert "Traceback" not in done.stderr
     done = suite(hostile, "check", "evil")
     assert done.returncode == 1
-    assert f"✗ builds: RuntimeError: first {CLEAN}" in done.stdout
+    assert "✗ builds: " in done.stdout
+    assert f"RuntimeError: first {CLEAN}" in done.stdout
     terminal = suite(hostile, "check", "evil", FORCE_COLOR="1", TERM="xterm-256color")
     assert "\x1b[1m" in terminal.stdout, "it believes to write to a terminal"
     assert "\x1b[2J" not in terminal.stdout

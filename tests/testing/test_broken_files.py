@@ -1,4 +1,4 @@
-"""Tasks and studies that break one rule each: edits of good files."""
+"""Tasks that break one rule each: edits of a good file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import registry
-from qrlsuite.specs import Spec, StudySpec, TaskSpec
+from qrlsuite.specs import TaskSpec
 from tests.conftest import TINY
 from tests.core.test_hooks import install
 from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids
@@ -94,57 +94,6 @@ TASKS = [
     edit("scores", r"^environment 'plain' gave no info\['score'\]", BEAM, environment("plain", 'source = "info"')),
     edit("scores", r"no episode ended within 20000 steps .* a time limit", BEAM, environment("plain", steps="1000000")),
 ]  # fmt: skip
-STUDY = """
-format_version = 1
-name = "small"
-summary = "Two sizes of a network"
-
-[[entries]]
-name = "mlp"
-task = "beam6g"
-model = "mlp"
-grid = { width = [8, 16] }
-
-[[entries]]
-name = "deep"
-task = "beam6g"
-model = "mlp"
-options = { depth = 3 }
-
-[[pictures]]
-kind = "bars"
-entries = ["mlp", "deep"]
-settings = { epsilons = [0.2], deltas = [0.5] }
-"""
-SPEEDS = """
-format_version = 1
-machine = "a laptop"
-
-[[speeds]]
-environment = "beam6g"
-algorithm = "ddqn"
-model = "mlp"
-options = { width = 8 }
-seconds = 0.1
-"""
-
-STUDIES = [
-    edit("format", r"^studies.toml: .*unknown key 'sumary'.*'summary'", "summary", "sumary"),
-    edit("format", r"^studies.toml: not valid TOML", "[[pictures]]", "[[pictures]"),
-    edit("format", r"no group 'dep'; did you mean 'deep'", '["mlp", "deep"]', '["mlp", "dep"]'),
-    edit("format", r"^studies.toml is not text in UTF-8, as TOML is", "Two sizes", "Zwei Größen"),
-    edit("says what is registered", r"as 'small', .* name = 'tiny': `qrlsuite list studies`", '"small"', '"tiny"'),
-    edit("says what is registered", r"with the summary .* read it from the file", "Two sizes", "Sizes"),
-    edit("entries", r"group 'mlp': unknown task 'beam5g'; did you mean 'beam6g", '"beam6g"', '"beam5g"'),
-    edit("entries", r"group 'mlp': unknown model 'mpl'; did you mean 'mlp'", '"mlp"\ngrid', '"mpl"\ngrid'),
-    edit("entries", r"group 'mlp': grid.widht: no option of that name; did you mean", "width =", "widht ="),
-    edit("entries", r"group 'mlp': .*width", "[8, 16]", "[8, 0]"),
-    edit("all shown", r"^deep: trained, and in no picture", '["mlp", "deep"]', '["mlp"]'),
-    edit("pictures", r"pictures.0.kind: unknown picture 'bar'; did you mean 'bars'", '"bars"', '"bar"'),
-    edit("pictures", r"pictures.0.settings.*'epsilon'; did you mean 'epsilons'", "epsilons", "epsilon"),
-]  # fmt: skip
-GOOD = {"tasks": TINY, "studies": STUDY}
-CASES = [(kind, edit) for kind, edits in (("tasks", TASKS), ("studies", STUDIES)) for edit in edits]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -162,53 +111,26 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     importlib.invalidate_caches()
 
 
-def spec(kind: str, path: Path | str, speeds: Path | str | None = None) -> Spec:
-    if kind == "tasks":
-        return TaskSpec("tiny", "A beam management task of seconds, for tests", path=str(path))
-    return StudySpec("small", "Two sizes of a network", str(path), speeds and str(speeds))
+def spec(path: Path | str) -> TaskSpec:
+    return TaskSpec("tiny", "A beam management task of seconds, for tests", path=str(path))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Good files, and one of speeds with a wrong key."""
-    for kind, text in GOOD.items():
-        (tmp_path / f"{kind}.toml").write_text(text)
-    (tmp_path / "speeds.toml").write_text(SPEEDS)
-    (tmp_path / "wrong.toml").write_text(SPEEDS.replace("seconds =", "second ="))
-    return tmp_path
+@pytest.mark.parametrize("edit", TASKS, ids=ids(TASKS))
+def test_one_rule_is_broken(edit: Edit, tmp_path: Path) -> None:
+    path = tmp_path / "tasks.toml"
+    path.write_bytes(edit.of(TINY).encode("latin-1"))
+    assert_breaks(spec(path), edit.rule, edit.message)
 
 
-@pytest.mark.parametrize(("kind", "edit"), CASES, ids=ids(edit for _, edit in CASES))
-def test_one_rule_is_broken(kind: str, edit: Edit, tmp_path: Path) -> None:
-    path = tmp_path / f"{kind}.toml"
-    path.write_bytes(edit.of(GOOD[kind]).encode("latin-1"))
-    assert_breaks(spec(kind, path), edit.rule, edit.message)
-
-
-@pytest.mark.parametrize("kind", GOOD)
-def test_a_file_is_where_the_spec_says(kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_where_the_spec_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     message = r"missing.toml is not there: is the TOML file among the package data, \[tool.setuptools.package-data\]"
-    assert_breaks(spec(kind, folder / "missing.toml"), "file", message)
-    monkeypatch.chdir(folder)
+    assert_breaks(spec(tmp_path / "missing.toml"), "file", message)
+    (tmp_path / "tasks.toml").write_text(TINY)
+    monkeypatch.chdir(tmp_path)
     message = r"is relative to the folder where .* write str\(Path\(__file__\).parent / ...\)"
-    assert_breaks(spec(kind, f"{kind}.toml"), "file", f"path = '{kind}.toml' {message}")
+    assert_breaks(spec("tasks.toml"), "file", f"path = 'tasks.toml' {message}")
 
 
-@pytest.mark.parametrize(
-    ("speeds", "message"),
-    [
-        ("speeds.toml", r"^speeds = 'speeds.toml' is relative to the folder"),
-        ("{folder}/missing.toml", r"missing.toml"),
-        ("{folder}/wrong.toml", r"unknown key 'second'.*'seconds'"),
-    ],
-)
-def test_speeds_that_cannot_be_read(speeds: str, message: str, folder: Path) -> None:
-    broken = spec("studies", folder / "studies.toml", speeds.format(folder=folder))
-    assert_breaks(broken, "speeds", message)
-
-
-@pytest.mark.parametrize("kind", GOOD)
-def test_every_rule_has_a_file_that_breaks_it(kind: str, folder: Path) -> None:
-    rules = assert_all_good(spec(kind, folder / f"{kind}.toml", folder / "speeds.toml"))
-    broken = {edit.rule for one, edit in CASES if one == kind} | {"file"}
-    assert rules == broken | ({"speeds"} if kind == "studies" else set())
+def test_every_rule_has_a_file_that_breaks_it(tmp_path: Path) -> None:
+    (tmp_path / "tasks.toml").write_text(TINY)
+    assert assert_all_good(spec(tmp_path / "tasks.toml")) == {edit.rule for edit in TASKS} | {"file"}

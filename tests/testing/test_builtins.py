@@ -38,23 +38,14 @@ RULES = {
         "state is seed-first", "seed independence", "options per agent", "state",
     ],
     "tasks": ["file", "format", "says what is registered", "identity", "algorithms", "ranking", "scores"],
-    "rules": ["builds", "signs", "repeatable", "antisymmetric", "equal entries", "direction"],
-    "engines": ["builds", "methods", "workers", "queued"],
-    "studies": ["file", "format", "says what is registered", "entries", "all shown", "pictures"],
-    "trackers": ["builds", "target", "events"],
 }  # fmt: skip
-"""Rules of each kind, after those that all have in common."""
+"""Rules of each kind that has some, after those that all have in common."""
 
 BACKENDS = ("native", "pennylane", "qiskit")
 WHERE_OFFERED = {
     ("circuit_backends", "native"): ["mean field", "shots"],
     ("circuit_backends", "pennylane"): ["shots"],
     ("circuit_backends", "qiskit"): ["shots"],
-    ("engines", "dask"): ["answers", "once"],
-    ("rules", "intervals"): ["against"],
-    ("rules", "times"): ["against"],
-    ("rules", "times-skewed"): ["against"],
-    **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind.kinds == "studies"},
     **{
         ("models", name): ["memory"]
         for name in (
@@ -95,9 +86,9 @@ def test_it_conforms(item: CheckTarget) -> None:
     options = OPTIONS if getattr(spec, "options", None) else []
     offered = WHERE_OFFERED.get((item.kind.kinds, item.name), [])
     nothing_to_build = (item.kind.kinds, item.name) == ("models", NO_MODEL)
-    expected = [*COMMON, *options, *([] if nothing_to_build else RULES[item.kind.kinds]), *offered]
+    expected = [*COMMON, *options, *([] if nothing_to_build else RULES.get(item.kind.kinds, [])), *offered]
     assert sorted(finding.rule for finding in findings) == sorted(expected)
 
 
 def test_no_kind_is_left_out() -> None:
-    assert RULES.keys() == KINDS.keys() == {item.kind.kinds for item in EVERYTHING}
+    assert RULES.keys() < KINDS.keys() == {item.kind.kinds for item in EVERYTHING}

@@ -18,6 +18,7 @@ from qrlsuite.plugins.trackers import common
 from qrlsuite.results.store import EntryStore
 from tests.commands import start_worker
 from tests.conftest import Hold, Train, most_epochs
+from tests.trackers import RECORD, RUN
 from tests.trackers.test_tensorboard import read as read_tensorboard
 
 Curves = dict[str, list[tuple[int, float]]]
@@ -54,18 +55,17 @@ def read_mlflow(folder: Path) -> Curves:
     return {name: [(point.step, point.value) for point in points] for name, points in histories.items()}
 
 
-TRACKED = """
+TRACKED = f"""
 import sys
 from pathlib import Path
 from qrlsuite import registry, specs
-from qrlsuite.testing.tracker import RECORD, RUN
 
 folder = Path("runs", "task", "entry", "seed-0007")
 folder.mkdir(parents=True)
-run = {**RUN, "folder": str(folder), "epochs": 0, "history": []}
+run = {RUN} | {{"folder": str(folder), "epochs": 0, "history": []}}
 tracker = specs.resolve(registry.get(specs.TrackerSpec, sys.argv[1]).factory)(None)
 tracker.run_started(run)
-tracker.epoch_finished(run, RECORD)
+tracker.epoch_finished(run, {RECORD})
 tracker.run_finished(run)
 """
 

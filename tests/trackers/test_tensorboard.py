@@ -11,9 +11,9 @@ import pytest
 from qrlsuite import registry, specs
 from qrlsuite.errors import QrlSuiteError, UnknownNameError
 from qrlsuite.plugins.trackers.tensorboard import TensorBoard
-from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.conftest import Train
+from tests.trackers import RECORD, RUN
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, float]]]:

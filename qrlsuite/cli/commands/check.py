@@ -127,7 +127,8 @@ def _show(
             with watching(announce(item)):
                 findings = _findings(item, settings, more)
             results.append((item, findings))
-            console.print(printable(item.title), style="bold")
+            loaded = "" if item.kind.kind in testing.KINDS else " (only loading and registering are checked)"
+            console.print(printable(f"{item.title}{loaded}"), style="bold")
             for finding in findings:
                 _print(console, finding)
     broken = sum(not finding.ok for _, findings in results for finding in findings)
