@@ -138,7 +138,7 @@ def check(study: Study) -> None:
 def read(selection: Selection, members: Sequence[Member]) -> dict[str, EntryResults]:
     """Return the learning curves of the entries that have any, by entry name; seeds kept for tuning are left out.
 
-    Those of an entry that comes with the suite, too, are added, see `collect.united`.
+    Own and published seeds of an entry are united, see `collect.united`.
     """
     curves_by_name = {}
     for entry in {member.entry.name: member.entry for member in members}.values():

@@ -133,7 +133,7 @@ class TimeRanking:
         return self.trade_offs() + self.against_the_order()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values of all pairs, for JSON. Matrices are in the order of `rows`, from the row's side."""
+        """Return plain values for JSON. Matrices are in the order of `rows`, from the row's side."""
         order = list(self.order)
         return {
             "alpha": self.board.alpha,
@@ -177,7 +177,7 @@ class TimeRanking:
         }
 
     def _pairs(self) -> list[tuple[int, int]]:
-        """All pairs, the entry with the smaller M first."""
+        """All pairs of the shown entries, the entry with the smaller M first."""
         return [(i, j) for place, i in enumerate(self.order) for j in self.order[place + 1 :]]
 
     def _thresholds(self, i: int, j: int) -> str:

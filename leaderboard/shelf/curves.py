@@ -57,11 +57,11 @@ class EntryResults(Shown):
     folder:
         Folder of its files; for a sum, the folder of the results with more seeds.
     mark:
-        What follows its name where seeds of one name are shown apart.
+        Text behind its name where seeds of one name are shown apart.
     refused:
         One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
     chosen_seeds:
-        Why no board ranks it, of a published entry whose seeds may have been chosen; empty otherwise.
+        Why no board ranks it, if its seeds may have been chosen for publication; empty otherwise.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     """
@@ -300,7 +300,7 @@ class EntryResults(Shown):
 
     @cached_property
     def environments(self) -> frozenset[str]:
-        """Digests of the environment's code, of every one that occurs among its seeds; none where it is the suite's."""
+        """Digests of every code of the environment among its seeds; none where it is the suite's."""
         return codes.environments(self._codes)
 
     @cached_property
@@ -310,7 +310,7 @@ class EntryResults(Shown):
 
     @property
     def plugins(self) -> Mapping[str, frozenset[str]]:
-        """Of the plugins by path among that code, by file name: which contents trained its seeds."""
+        """Marks of the contents of plugins by path that trained its seeds, by file name."""
         return codes.contents(self.record, self.codes)
 
     def marked(self, mark: str) -> EntryResults:

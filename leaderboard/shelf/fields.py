@@ -123,7 +123,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     -------
     pyarrow.Table
         The columns are `FIELDS[rows]`, for entries those of `of_entry`, each option, and each metric (`measured.NAME`,
-        averaged like the row's score); null if an entry has it not. A column of whole and other numbers is float64, a
+        averaged like the row's score); null if an entry lacks it. A column of whole and other numbers is float64, a
         column of numbers and texts is text; lists are JSON.
     """
     make: dict[Rows, Callable[[EntryResults], dict[str, Sequence[Any] | NDArray[Any]]]] = {

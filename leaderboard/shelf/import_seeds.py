@@ -2,7 +2,7 @@
 
 They count as seeds that were trained here, and `qrlsuite run` trains only the missing ones. Each seed's folder is
 copied beside its place and renamed into it, so that no half copy counts, and a repeated import continues a stopped
-one. Existing seeds stay unchanged.
+one. An existing seed stays unchanged, unless the curve that comes continues its own.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.records import MEASURED, Provenance, RunRecord
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
+    ASIDE,
     Arrays,
     EntryStore,
     SeedRun,
@@ -225,16 +226,19 @@ def unite(
 def _place(store: EntryStore, seed: int, write: Writer) -> None:
     """Put a seed into its place, whole or not at all; an existing seed stays until the new one is whole."""
     place = store.seed(seed).path
-    made, old = (place.with_name(f".{place.name}.{word}") for word in ("import", "old"))
+    made, aside = (place.with_name(f".{place.name}{end}") for end in (".import", ASIDE))
     try:
-        for path in (made, old):
-            shutil.rmtree(path, ignore_errors=True)
+        shutil.rmtree(made, ignore_errors=True)
         write(SeedStore(made, seed))
         if place.exists():
-            place.rename(old)
+            shutil.rmtree(aside, ignore_errors=True)
+            place.rename(aside)
         made.rename(place)
-        shutil.rmtree(old, ignore_errors=True)
+        if aside.exists():
+            aside.rename(made)  # so that a half-removed folder is never put back
+        shutil.rmtree(made, ignore_errors=True)
     except OSError as error:
+        store.seeds()  # puts the old seed back
         shutil.rmtree(made, ignore_errors=True)
         raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
 

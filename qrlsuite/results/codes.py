@@ -237,7 +237,7 @@ def prepare(store: EntryStore, current: CodeIdentity, plugins: Sequence[own.Sour
 
 
 def contents(record: EntryRecord, digests: Iterable[str]) -> dict[str, frozenset[str]]:
-    """Return where an entry's copies of plugins are, by the digest of the code that they belong to."""
+    """Return the marks of the copied plugins that belong to some codes, by the plugin's file name."""
     marks: dict[str, set[str]] = {}
     for place in (place for digest in digests for place in record.plugins.get(digest, [])):
         _, mark, name = place.split("/")

@@ -54,6 +54,8 @@ from qrlsuite.statistics.grid import settled
 
 _MARK = re.compile(r"@[0-9a-f]{8}")
 _SEED_FOLDER = re.compile(r"seed-(\d{4}|[1-9]\d{4,})", re.ASCII)
+ASIDE = ".old"
+"""End of the name `.seed-0007.old` of a seed's folder while an import puts a longer run into its place."""
 MOST_AGENT_BYTES = 200_000_000
 """A file of parameters that is larger than this is not read."""
 
@@ -681,7 +683,15 @@ class EntryStore:
         return SeedStore(self.path / f"seed-{seed:04d}", seed, self)
 
     def seeds(self) -> list[int]:
-        """Return the seeds that have a folder, sorted; `seed-00007` is none, for seed 7 has `seed-0007`."""
+        """Return the seeds that have a folder, sorted; `seed-00007` is none, for seed 7 has `seed-0007`.
+
+        A seed that a killed import had moved aside, and not replaced yet, is put back.
+        """
+        for aside in self.path.glob(f".seed-*{ASIDE}"):
+            place = aside.with_name(aside.name[1 : -len(ASIDE)])
+            if _SEED_FOLDER.fullmatch(place.name) and not place.exists():
+                with contextlib.suppress(OSError):  # the import is alive, or the folder cannot be written
+                    aside.rename(place)
         matches = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
         return sorted(int(match.group(1)) for match in matches if match)
 

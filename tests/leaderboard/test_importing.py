@@ -183,6 +183,31 @@ def test_a_seed_that_goes_on_there_is_taken_over(copied: EntryStore, elsewhere: 
     assert (again.new, again.known, again.notes) == ((), (0, 1), ()), "the longer curve stays"
 
 
+@pytest.mark.parametrize("renames", range(3))
+def test_a_killed_replacement_loses_no_seed(
+    renames: int, copied: EntryStore, elsewhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after so many renames: the next command finds two epochs or three, and the import can be repeated."""
+    store = take(elsewhere, tmp_path / "runs").store
+    train_group(copied.path, [1], 3)
+    rename, left = Path.rename, [renames]
+
+    def killed(self: Path, target: Path) -> Path:
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        return rename(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            import_seeds.import_seeds(copied, tmp_path / "runs")
+    assert store.seeds() == [0, 1]
+    assert store.seed(1).read().epochs == (3 if renames == 2 else 2)
+    import_seeds.import_seeds(copied, tmp_path / "runs")
+    assert files(store.seed(1).path) == files(copied.seed(1).path)
+
+
 def test_seeds_in_training_are_left_there(copied: EntryStore, task: str, tmp_path: Path) -> None:
     claim = acquire(copied, [1])
     done = import_seeds.import_seeds(copied, tmp_path / "runs")
