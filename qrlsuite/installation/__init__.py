@@ -1,25 +1,21 @@
-"""Tests the installation for `qrlsuite doctor`: packages, plugins, the simulator, a GPU, the results folder."""
+"""Collects the facts for `qrlsuite doctor`: versions, devices, plugins, the compile cache, the results folder."""
 
 from __future__ import annotations
 
 import fcntl
 import importlib.util
-import json
 import os
 import platform
 import shutil
-import subprocess
 import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from packaging.requirements import InvalidRequirement, Requirement
-from packaging.specifiers import SpecifierSet
+from packaging.requirements import Requirement
 
 import qrlsuite
 from qrlsuite import registry
@@ -33,9 +29,6 @@ VARIABLES = ("OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "CUDA_", "QRLSUITE_", "XDG_C
 
 LOW_DISK_BYTES = 1_000_000_000
 """Free bytes below which the results folder is reported as nearly full; a seed takes a quarter of a megabyte."""
-
-PROBE_SECONDS = 600
-"""Time limit for importing all packages and compiling the simulator."""
 
 
 @dataclass
@@ -55,28 +48,22 @@ class Diagnosis:
     remarks: list[str] = field(default_factory=list)
 
 
-def diagnose(runs: Path, announce: Callable[[str], None] = lambda step: None) -> Diagnosis:
-    """Test everything; a test that raises is reported as broken.
-
-    Parameters
-    ----------
-    runs:
-        The results folder.
-    announce:
-        Called with the name of each step that takes a while, before it.
-    """
+def diagnose(runs: Path) -> Diagnosis:
+    """Collect everything about this installation and a results folder; what raises is reported as broken."""
     diagnosis = Diagnosis()
-    tests: dict[str, Callable[[], None]] = {
+    parts: dict[str, Callable[[], None]] = {
         "python": lambda: _python(diagnosis),
         "packages": lambda: _packages(diagnosis),
-        "probe": lambda: _probe(diagnosis, announce),
+        "GPU": lambda: _gpu(diagnosis),
+        "cache": lambda: _cache(diagnosis),
         "plugins": lambda: _plugins(diagnosis),
         "runs": lambda: _runs(runs, diagnosis),
     }
-    for name, test in tests.items():
+    for name, collect_part in parts.items():
         try:
-            test()
+            collect_part()
         except Exception as error:
+            diagnosis.facts.setdefault(name, "fails")
             diagnosis.broken.append(f"{name}: {registry.words(error)}")
     return diagnosis
 
@@ -96,41 +83,20 @@ def _python(diagnosis: Diagnosis) -> None:
         "variables": " ".join(variables) or "none set",
         "sbatch": shutil.which("sbatch") or "none",
     }
-    try:
-        installed = metadata.metadata("qrlsuite")
-    except metadata.PackageNotFoundError:
-        diagnosis.broken.append(f"{location} is on the path but not installed: pip install it")
-        return
-    if installed["Version"] != qrlsuite.__version__:
-        diagnosis.broken.append(
-            f"{location} is qrlsuite {qrlsuite.__version__}, installed is {installed['Version']}: install it again"
-        )
-    needed = installed["Requires-Python"] or ""
-    if not SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
-        diagnosis.broken.append(
-            f"Python {platform.python_version()} is not supported: qrlsuite needs {needed}"
-        )
-
-
-def requirements() -> Iterator[tuple[Requirement, bool]]:
-    """Yield the requirements of the suite on this Python, and whether each belongs to an extra."""
-    try:
-        lines = metadata.requires("qrlsuite") or []
-    except metadata.PackageNotFoundError:
-        return
-    for line in lines:
-        try:
-            requirement = Requirement(line)
-        except InvalidRequirement:
-            continue
-        extra = "extra ==" in str(requirement.marker)
-        if extra or requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-            yield requirement, extra
 
 
 def _packages(diagnosis: Diagnosis) -> None:
+    """Compare versions with the suite's requirements; what only an extra needs is never broken."""
+    if (installed := metadata.version("qrlsuite")) != qrlsuite.__version__:
+        diagnosis.broken.append(
+            f"qrlsuite {qrlsuite.__version__} runs, and {installed} is installed: install it again"
+        )
     versions = {}
-    for requirement, extra in requirements():
+    for line in metadata.requires("qrlsuite") or []:
+        requirement = Requirement(line)
+        extra = "extra ==" in str(requirement.marker)
+        if not extra and requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
         name = requirement.name
         try:
             versions[name] = metadata.version(name)
@@ -145,42 +111,32 @@ def _packages(diagnosis: Diagnosis) -> None:
     diagnosis.facts["packages"] = ", ".join(f"{name} {version}" for name, version in versions.items())
 
 
-def _probe(diagnosis: Diagnosis, announce: Callable[[str], None]) -> None:
-    """Import every required package and compute a circuit in another process, which a broken library may end."""
-    names = [requirement.name.lower().replace("-", "_") for requirement, extra in requirements() if not extra]
-    modules = [name for name in names if importlib.util.find_spec(name) is not None]
-    answers: dict[str, Any] = {}
-    step = "start Python"
-    with tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "qrlsuite.installation.probe", *modules],
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-        )
-        timer = threading.Timer(PROBE_SECONDS, process.kill)
-        timer.start()
-        try:
-            for line in process.stdout or ():
-                step, answer = json.loads(line)
-                announce(step)
-                answers[step] = answer
-            process.wait()
-        finally:  # after Ctrl-C, or a line that is no answer
-            timer.cancel()
-            process.kill()
-            process.communicate()
-        errors.seek(0)
-        last_line = (errors.read().strip().splitlines() or ["no message"])[-1]
-    failed: dict[str, list[str]] = {}
-    for name, answer in answers.items():
-        if answer is not None and "error" in answer:
-            failed.setdefault(answer["error"], []).append(name)
-    diagnosis.broken += [f"{', '.join(steps)}: {error}" for error, steps in failed.items()]
-    if process.returncode:
-        diagnosis.broken.append(f"{step}: the process ended with code {process.returncode}: {last_line}")
-    for name in ("GPU", "simulator"):
-        diagnosis.facts[name] = (answers.get(name) or {}).get("text", "fails")
+def _gpu(diagnosis: Diagnosis) -> None:
+    """Name torch's build and its GPUs, and say whether circuits run there by kernels."""
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    devices = map(torch.cuda.get_device_properties, range(count))
+    names = [f"{device.name} {device.total_memory / 1e9:.0f} GB" for device in devices]
+    driver = "an" if os.path.exists("/proc/driver/nvidia/version") else "no"
+    built = f"torch for CUDA {torch.version.cuda}" if torch.version.cuda else "torch for the CPU"
+    text = f"{', '.join(names) or 'none'}, {built}, {driver} NVIDIA driver"
+    if names:
+        from qrlsuite.circuit import Circuit, create_backend
+
+        circuit = Circuit(1)
+        circuit.append("RX", 0, circuit.input(0))
+        native: Any = create_backend("native", circuit)
+        problem = native.gpu_trouble()
+        text += ", circuits " + (f"slow there: {problem}" if problem else "by kernels")
+    diagnosis.facts["GPU"] = text
+
+
+def _cache(diagnosis: Diagnosis) -> None:
+    from qrlsuite.compiled import cache
+
+    folder = cache.folder(Path(cache.__file__).parent).parent
+    diagnosis.facts["cache"] = f"{folder}, {len([*folder.rglob('*.nbc')])} compiled kernels"
 
 
 def _plugins(diagnosis: Diagnosis) -> None:

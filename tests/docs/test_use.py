@@ -21,7 +21,7 @@ SMALL = {
 """What is appended to a command, so that it takes seconds; the last of two equal options counts."""
 CIRCUIT = ("qubits=2", "layers=1", "--seeds", "1")
 ELSEWHERE = {"doctor", "view"}
-"""`doctor` imports every package anew, and `view` ends with Ctrl-C: cli/test_doctor.py, leaderboard/test_live.py."""
+"""`doctor` looks at this machine, and `view` ends with Ctrl-C: cli/test_doctor.py, leaderboard/test_live.py."""
 
 
 def commands(page: str = "docs/start.md", section: str = "Every command once") -> list[list[str]]:

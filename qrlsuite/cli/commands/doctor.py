@@ -1,4 +1,4 @@
-"""`qrlsuite doctor`: test the installation, and print the facts for a bug report."""
+"""`qrlsuite doctor`: print the facts for a bug report."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import json
 from pathlib import Path
 
 import typer
-from rich.console import Console
-from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import printable
@@ -16,16 +14,13 @@ from qrlsuite.installation import diagnose
 
 
 def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> None:
-    """Test the installation, the plugins and the results folder, and print the facts for a bug report.
+    """Print the facts for a bug report: versions, devices, plugins, the compile cache, and the results folder.
 
-    Imports every package that is needed and computes a circuit, which takes some seconds. Nothing is changed.
-
-    Exit codes: 0 the suite can be used, 1 something that it needs is broken.
+    Exit codes: 0 nothing is missing, 1 something that the suite needs is missing or broken.
 
     Example: qrlsuite doctor > report.txt
     """
-    with Console(stderr=True).status("") as status:
-        diagnosis = diagnose(runs, lambda step: status.update(Text(printable(step))))
+    diagnosis = diagnose(runs)
     if json_output:
         typer.echo(json.dumps({"ok": not diagnosis.broken, **dataclasses.asdict(diagnosis)}))
     else:
@@ -37,6 +32,6 @@ def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> 
         for remark in diagnosis.remarks:
             typer.secho(f"note: {printable(remark)}", fg="yellow")
         if not diagnosis.broken:
-            typer.secho("everything that is needed works", fg="green", bold=True)
+            typer.secho("nothing is missing", fg="green", bold=True)
     if diagnosis.broken:
         raise typer.Exit(1)
