@@ -95,8 +95,6 @@ class Column(Generic[Row]):
         """Its heads in a spreadsheet."""
         if self.flat is not None:
             return self.flat
-        if self.name == "ranks":
-            return ("rank", "rank_worst")
         stem = self.name.removesuffix("_interval")
         return (f"{stem}_low", f"{stem}_high") if self.name.endswith("interval") else (self.name,)
 

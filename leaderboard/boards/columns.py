@@ -157,6 +157,11 @@ def names_text(names: Sequence[str]) -> str:
     return ", ".join(names) or "-"
 
 
+def ranks_column(read: Callable[[Any], Sequence[int] | None], **more: Any) -> Column[Any]:
+    """Return the column of best and worst ranks."""
+    return Column("ranks", read, ranks_text, head="rank", flat=("rank", "rank_worst"), **more)
+
+
 def ranks_text(ranks: Sequence[int]) -> str:
     """Write the best and worst rank of an entry: `3`, or `3-5`."""
     return "-".join(map(str, dict.fromkeys(ranks)))
@@ -192,14 +197,11 @@ def ranks(section: Section) -> list[Column[Row]]:
         )
 
     return [
-        Column(
-            "ranks",
+        ranks_column(
             lambda row: None if row.time.ranks is None else list(row.time.ranks),
-            ranks_text,
-            "1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
+            meaning="1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
             "A outperforms B if it needs significantly fewer steps at a threshold, and significantly more at none "
             "(permutation tests, Holm's correction over all pairs of the board, filtered out or not)",
-            head="rank",
             hover=lambda row: TOO_FEW if row.time.ranks is None else "",
         ),
         _name(section),

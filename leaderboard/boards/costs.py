@@ -20,7 +20,7 @@ from qrlsuite.columns import Column, flat, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import listed
 from qrlsuite.leaderboard.boards import tables
-from qrlsuite.leaderboard.boards.columns import estimate, names_text, ranks_text
+from qrlsuite.leaderboard.boards.columns import estimate, names_text, ranks_column, ranks_text
 from qrlsuite.leaderboard.boards.ranked import Complexity, complexity_at, ranking_of
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import collect
@@ -238,11 +238,8 @@ class CostSection:
         text, head = self.unit.text, f"{self.unit.name} {self.before} threshold ({self.level})"
         complexity_head = "sample complexity (5%-95%)"
         return [
-            Column(
-                "ranks",
-                lambda row: None if (ranks := self.ranks(row)) is None else list(ranks),
-                head="rank",
-                cell=self.rank_text,
+            ranks_column(
+                lambda row: None if (ranks := self.ranks(row)) is None else list(ranks), cell=self.rank_text
             ),
             Column("entry", lambda row: row.entry.name, cell=lambda row: row.entry.label, words=True),
             Column("label", lambda row: row.entry.label),

@@ -14,7 +14,7 @@ from qrlsuite.columns import Column, flat, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import steps, tables
-from qrlsuite.leaderboard.boards.columns import estimate, ranks_text
+from qrlsuite.leaderboard.boards.columns import estimate, ranks_column
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import interval_text, score_text, steps_text
 from qrlsuite.statistics import (
@@ -96,7 +96,7 @@ class ScoreSection:
             return self._better(*order[place : place + 2]) if place + 1 < len(order) else None
 
         return (
-            Column("ranks", lambda place: list(self.ranks[order[place]]), ranks_text, head="rank"),
+            ranks_column(lambda place: list(self.ranks[order[place]])),
             Column(
                 "entry",
                 lambda place: self.entries[order[place]].name,

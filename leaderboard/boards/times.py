@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from qrlsuite.leaderboard.boards.columns import ranks_text
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import interval_text, percent
 from qrlsuite.statistics import (
@@ -58,7 +59,7 @@ class TimeRow:
     @property
     def rank_text(self) -> str:
         """`3`, `3-5`, or `-` below 20 seeds."""
-        return "-" if self.ranks is None else "-".join(map(str, dict.fromkeys(self.ranks)))
+        return "-" if self.ranks is None else ranks_text(self.ranks)
 
     @property
     def difference_text(self) -> str:

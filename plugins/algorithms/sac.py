@@ -30,7 +30,7 @@ Deviations from the papers:
 - The loss is linear in log alpha, not in alpha, as in the authors' code.
 - Batch 256, a learning rate of 3e-4, tau 0.005 and `warm_up` 100 are Stable-Baselines3's defaults, and except for
   `warm_up` the paper's; Christodoulou has batch 64 and a gradient step every fourth interaction.
-- One gradient step per round of all environments; the papers have one environment.
+- One gradient step per round of all environments; the papers have one environment, hence a step per interaction.
 - The replay buffer holds 50,000 transitions, not a million: it is part of every checkpoint.
 - Networks have the architecture of the entry's model; a critic is given s, and then a, in its first layer.
 """

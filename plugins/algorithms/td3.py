@@ -22,7 +22,7 @@ hyperbolic tangent of the model's outputs. A time limit that truncates an episod
 Deviations from the paper:
 - Batch 256 and one learning rate of 1e-3 for actor and critics are Stable-Baselines3's defaults; the paper has 100, and
   1e-3 for both. A `warm_up` of 100 transitions is Stable-Baselines3's, too; the paper has 1000 or 10,000.
-- One gradient step per round of all environments; the paper has one environment.
+- One gradient step per round of all environments; the paper has one environment, hence a step per interaction.
 - The replay buffer holds 50,000 transitions, not a million: it is part of every checkpoint.
 - Networks have the architecture of the entry's model; a critic is given s, and then a, in its first layer.
 """

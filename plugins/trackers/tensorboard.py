@@ -8,7 +8,7 @@ Event files lie in `tensorboard/` in each seed's folder; with `--track tensorboa
 `training/return`, `training/score`, `training/loss` and the algorithm's other metrics are from `epochs.jsonl`.
 
 A resumed run repeats the epochs after its checkpoint. Its new event file names its first epoch, and readers drop
-later epochs of earlier files (TensorBoard's session start), so every epoch is shown once. Files are opened for
+epochs from there on in earlier files (TensorBoard's session start), so every epoch is shown once. Files are opened for
 each epoch alone: a worker trains a hundred seeds, and TensorBoard's own writer would keep a thread for each.
 """
 

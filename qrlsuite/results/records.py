@@ -209,7 +209,7 @@ class ImportedRecord(Record):
     """From what curves of another program were made."""
 
     grid: str = ""
-    maximum: float | None = None
+    maximum: Number | None = None
 
 
 def _told(imported: Any) -> Any:
@@ -499,7 +499,7 @@ class DecidedPair(Record):
     """Two entries of a study at a look, with their p and the decision, if any."""
 
     pair: list[str]
-    p: float | None = None
+    p: Annotated[float | None, Field(strict=True, ge=0, le=1)] = None
     decided: str | None = None
 
 
@@ -525,5 +525,13 @@ class RoundLine(Record):
     round: Count
     lanes: Positive
     steps: Count
-    returns: list[list[float]]
-    scores: list[list[float | None]]
+    returns: list[list[Number]]
+    scores: list[list[Number | None]]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if {*map(len, self.returns), *map(len, self.scores)} != {self.lanes}:
+            raise ValueError("not as many returns or scores as lanes")
+        if len(self.returns) != len(self.scores):
+            raise ValueError("not as many agents with returns as with scores")
+        return self

@@ -198,3 +198,11 @@ def test_what_no_entry_can_have_published(name: str, value: Any) -> None:
     content = {**ENTRY_CONTENT, "published": {**ENTRY_CONTENT["published"], name: value}}
     with pytest.raises(StoreError, match=f"published.{name}"):
         EntryRecord.read(content, ENTRY)
+
+
+@pytest.mark.parametrize(
+    "damage", [{"lanes": 3}, {"scores": [[0.5, 0.5]] * 2}, {"returns": [[1.0, float("nan")]]}]
+)
+def test_a_round_has_a_number_for_every_agent_and_lane(damage: dict[str, Any]) -> None:
+    with pytest.raises(StoreError, match="is not a round of an evaluation"):
+        RoundLine.read({**ROUND_CONTENT, **damage}, LINES)
