@@ -163,6 +163,7 @@ def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) ->
         "kind": str(kind),
         "article": "an" if kind[0] in "ae" else "a",
         "summary": template_words.summary,
+        "things": [(each.kind, thing) for each in kinds],
         "check": checks[0],
         "commands": commands,
         "contents": list(contents.items()),
@@ -176,18 +177,21 @@ def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) ->
     files = rendered(values)
     for path in contents:
         template = "test.py" if path.startswith("tests/") else Path(path).name
-        files[path] = render(f"{kind}/{template}.jinja")
+        if path not in files or (TEMPLATES / kind / f"{template}.jinja").exists():
+            files[path] = render(f"{kind}/{template}.jinja")
     files[f"{source}/py.typed"] = ""
     return Package(name, module, thing, commands, files)
 
 
 def rendered(values: Mapping[str, object]) -> dict[str, str]:
     """Return the files of every package, with values in the places that their templates have for them."""
+    templates = {name: name for name in ("pyproject.toml", "README.md")}
+    templates[f"tests/test_{values['module']}.py"] = "test.py"
     return {
-        name: _templates()
-        .get_template(f"common/{name}.jinja")
+        path: _templates()
+        .get_template(f"common/{template}.jinja")
         .render({**values, "versions": compatible_versions()})
-        for name in ("pyproject.toml", "README.md")
+        for path, template in templates.items()
     }
 
 

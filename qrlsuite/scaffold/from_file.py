@@ -75,7 +75,6 @@ def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
     kinds = [each.spec for each in kept]
     checks = [f"qrlsuite check {spec.kind.replace('_', '-')}:{spec.name}" for spec in kinds]
     commands = ("pytest", *checks, *(line for spec in kinds for line in commands_of(spec.kind, spec.name)))
-    files[f"tests/test_{module}.py"] = _test(kinds)
     contents = {
         f"src/{module}/__init__.py": "registers with qrlsuite",
         **({f"src/{module}/{inner}.py": f"what was {source.name}: edit this"} if inner else {}),
@@ -83,6 +82,7 @@ def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
     }
     summary = " ".join(kinds[0].summary.rstrip(".").split()) if kinds else f"what {source.name} registers"
     values = {"name": name, "module": module, "thing": kinds[0].name if kinds else name, "kind": "plugin"}
+    values |= {"things": [(spec.kind, spec.name) for spec in kinds]}
     values |= {"article": "a", "summary": re.sub(r'["\\]', "'", summary)}
     data = any(not file.endswith(".py") for file in source.files)
     common = rendered({**values, "commands": commands, "contents": list(contents.items()), "files": data})
@@ -275,13 +275,3 @@ def _call(spec: specs.Spec, short: _Short | None, module: str, inner: str) -> st
         )
         lines.append(f"            {each.name}={written},\n")
     return f"    register(\n        specs.{type(spec).__name__}(\n{''.join(lines)}        )\n    )\n"
-
-
-def _test(kinds: Sequence[specs.Spec]) -> str:
-    cases = "".join(f'        ("{spec.kind}", "{spec.name}"),\n' for spec in kinds)
-    return (
-        '"""The checks that `qrlsuite check` runs."""\n\n'
-        "import pytest\nfrom qrlsuite.testing import assert_conforms\n\n\n"
-        f'@pytest.mark.parametrize(\n    ("kind", "name"),\n    [\n{cases}    ],\n)\n'
-        "def test_it_conforms(kind: str, name: str) -> None:\n    assert_conforms(kind, name)\n"
-    )
