@@ -1,6 +1,6 @@
 """A column of a table as data: terminal, Markdown, LaTeX, the page, csv, JSON and Arrow are made of the same list.
 
-Column("seeds", lambda entry: len(entry.seeds), str, "complete runs")
+A short one is `Column("seeds", lambda entry: len(entry.seeds), str, "complete runs")`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Column(Generic[Row]):
     text:
         Writes a value into a cell; None where only files have the column.
     meaning:
-        What it says, in a sentence; empty where its name does.
+        Its meaning in a sentence; empty where the name explains it.
     head:
-        What tables call it; by default its name.
+        Its name in tables; by default `name`.
     cell:
         Writes a row into a cell, where that shows more than the value: an interval, or a mark.
     flat:
@@ -39,13 +39,13 @@ class Column(Generic[Row]):
         A row's bar: low, point and high of an interval, from 0 on; None where there is none. The terminal draws it
         from the low to the high end, the page with the point.
     beside, hover:
-        What the page, which has room, writes behind a row's cell, and what a pointer shows there.
+        Texts of the page, which has room: behind a row's cell, and where a pointer rests on it.
     most:
         Whether the page sorts the largest first.
     unit:
-        What its numbers count, for Arrow; empty for counts of what the name says, and scores.
+        Unit of its numbers, for Arrow; empty for scores, and counts whose name is the unit.
     type:
-        Of its values in Arrow: text, whole or real numbers, truth values; None takes that of the values that occur.
+        Type of its values in Arrow: text, whole or real numbers, truth values; None takes the type that occurs.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Column(Generic[Row]):
 
     @property
     def title(self) -> str:
-        """What tables call it."""
+        """Its name in tables."""
         return self.head or self.name.replace("_", " ")
 
     @property

@@ -75,7 +75,7 @@ class Row:
     time:
         Its rank, by steps below threshold.
     costs:
-        By name, the mean over seeds and the last tenth of the epochs of what `[ranking] costs` names.
+        The metrics that `[ranking] costs` names: means over seeds and the last tenth of the epochs.
     provisional:
         Whether it has fewer seeds than the task's protocol asks for.
     """
@@ -137,17 +137,17 @@ class Section:
     provisional:
         Whether it is shorter than the task's own horizons.
     ranking, score:
-        The task's thresholds, cells, costs and policies; and what it scores.
+        The task's thresholds, cells, costs and policies; and its score.
     entries:
-        All that are compared.
+        All compared entries.
     rows:
-        Those that are shown, in the order of their steps below threshold.
+        The shown entries, in the order of their steps below threshold.
     times:
-        What ranks them.
+        Their ranks.
     judge:
         The significance rule that the tiers rest on.
     by_tiers:
-        Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it.
+        Whether tables show tiers by that rule in the place of ranks: if the user or the task names it.
     """
 
     task: str

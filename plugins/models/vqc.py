@@ -115,7 +115,7 @@ class VQCOptions:
         Field(
             gt=0,
             allow_inf_nan=False,
-            description="factor on the layer behind the circuit's learning rate, for values far beyond -1..1",
+            description="learning rate of the layer behind the circuit, as a factor; for values far beyond -1..1",
         ),
         Since("0.2.0"),
     ] = 1.0

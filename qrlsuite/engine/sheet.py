@@ -40,10 +40,10 @@ class Sheet:
     Attributes
     ----------
     columns:
-        In the order of their importance: where a line has no room for all, the last are left out. Those that no table
-        shows are left out.
+        In the order of their importance: where a line has no room for all, the last are left out. Columns for files
+        alone are left out, too.
     rows:
-        What the columns write.
+        The rows from which the columns read.
     notes:
         In the order of their importance: the first three are written, unless `explained`.
     explained:
@@ -53,7 +53,7 @@ class Sheet:
     label:
         By which LaTeX refers to it.
     name:
-        What a page with several tables calls it.
+        Its title on a page with several tables.
     """
 
     title: str

@@ -67,7 +67,7 @@ class CodeIdentity:
 
     @property
     def original(self) -> bool:
-        """Whether all code is the suite's first version; seeds without a recorded identity have it."""
+        """Whether all code is the suite's, with its first bits, as of seeds without a recorded identity."""
         return all(
             part.get("distribution") == OURS and part.get("numerics", 1) == 1
             for part in self.parts

@@ -1,7 +1,7 @@
 """The code identities of an entry's seeds: which seeds make one entry, and the ways on after the code has changed.
 
 Under `code`, `run.json` has the identity of the code that began the seed, and `entry.json` that of the code that trains
-now. Older seeds have no identity: they were made by the suite's first version, or by unknown code of a plugin. Codes
+now. Older seeds have no identity: they have the suite's first bits, or unknown code of a plugin. Codes
 that an author declared to be equal in effect stand in `entry.json` under `same`.
 """
 
