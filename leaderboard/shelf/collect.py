@@ -254,20 +254,24 @@ def best(copies: Iterable[EntryResults]) -> EntryResults:
 
 
 def united(copies: Sequence[EntryResults]) -> tuple[EntryResults, str]:
-    """Return the union of an entry's copies; or where it cannot be, the best copy, and why.
+    """Return the union of an entry's copies, or the best copy if they differ; and the reason why some are left out.
 
     Copies of another code are left out, and shorter copies within the task's shortest horizon.
     """
     further = best(copies)
     far = _weight(further)[0]
-    equal = [copy for copy in copies if copy.mark == further.mark and _weight(copy)[0] == far]
+    same = [copy for copy in copies if copy.mark == further.mark]
+    shown = f"{_size(further)} of the same entry, from {further.folder}"
     try:
-        return functools.reduce(operator.add, equal), ""
+        whole = functools.reduce(operator.add, [copy for copy in same if _weight(copy)[0] == far])
     except DifferentCurvesError as error:
-        shown = (
-            f"{len(further.seeds)} seeds of {further.epochs} epochs of the same entry, from {further.folder}"
-        )
         return further, f"{error}; shown are {shown}"
+    shorter = [copy for copy in same if copy.source == "published" and _weight(copy)[0] < far]
+    return whole, "; ".join(f"{copy.folder}: {_size(copy)}; shown are {shown}" for copy in shorter)
+
+
+def _size(entry: EntryResults) -> str:
+    return f"{len(entry.seeds)} seeds of {entry.epochs} epochs"
 
 
 def read_copies(selection: Selection, name: str) -> list[EntryResults]:

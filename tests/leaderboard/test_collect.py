@@ -80,7 +80,7 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     object.__setattr__(several[0], "task_file", lying)
     for order in (several, several[::-1]):
         assert ranked.ranking_of(order) == ranking
-        assert board.build(order).sections[0].cell == ranking.cell
+        assert board.build(order).sections[0].ranking.cell == ranking.cell
     assert ranked.ranking_of(several[:2]) == ranked.ranking_of(several[1::-1])
 
 
@@ -239,3 +239,9 @@ def test_results_of_two_entries_do_not_add() -> None:
     coded = boards.changed(boards.entry("mlp a"), code=CODE)
     with pytest.raises(OptionError, match="are not the same entry"):
         boards.entry("mlp a") + coded
+
+
+def test_published_seeds_that_end_before_own_ones_are_named() -> None:
+    own, there = boards.entry("mlp a"), boards.changed(boards.entry("mlp a", 30, 50), published=True)
+    shown = "20 seeds of 100 epochs of the same entry, from mlp a"
+    assert collect.united([own, there]) == (own, f"mlp a: 30 seeds of 50 epochs; shown are {shown}")
