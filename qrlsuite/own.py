@@ -11,7 +11,6 @@ recognized in its top-level module is registered: see `qrlsuite.shortforms`.
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import hashlib
 import importlib
@@ -73,37 +72,6 @@ class Source:
         for name in sorted(self.files):
             content.update(f"{name}\0{len(self.files[name])}\0".encode() + self.files[name])
         return content.hexdigest()[:16]
-
-    def packed(self) -> dict[str, Any]:
-        """Return the name and the content, in base64 by file, as plain values."""
-        return {"name": self.name, "files": {n: base64.b64encode(c).decode() for n, c in self.files.items()}}
-
-    @classmethod
-    def unpacked(cls, packed: Any, folder: Path) -> Source:
-        """Return a result of `packed` as a plugin in its own folder below another folder; writes nothing.
-
-        Raises
-        ------
-        PluginError
-            If it is none, or a file would lie elsewhere.
-        """
-        try:
-            name = str(packed["name"])
-            files = {
-                str(n): base64.b64decode(content, validate=True) for n, content in packed["files"].items()
-            }
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise PluginError(f"a plugin cannot be unpacked: {registry.words(error)}") from None
-        module = name.removesuffix(".py")
-        inside = all(
-            path == name
-            or (PurePosixPath(path).parts[:1] == (name,) and ".." not in PurePosixPath(path).parts)
-            for path in files
-        )
-        if not module.isidentifier() or not files or not inside:
-            raise PluginError(f"{name!r} is no plugin that can be unpacked")
-        draft = cls(folder / name, files)
-        return cls(folder / draft.mark / name, files)
 
     def place(self, relative: str) -> str:
         """Return the whole path of one of the files."""

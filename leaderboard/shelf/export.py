@@ -135,7 +135,7 @@ def _found(runs: Sequence[SeedRun]) -> dict[str, Any]:
 def _made_with(origins: Sequence[Provenance]) -> Provenance:
     """Return the provenance of a seed's last epochs; under `before`, different provenances of earlier epochs.
 
-    The `host` in a remote worker's record is private.
+    The `host` in an older Dask worker's record is private.
     """
     *earlier, last = [origin.without_host for origin in origins] or [Provenance()]
     before = [origin for origin in _distinct(earlier) if origin != last]

@@ -30,7 +30,7 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
     register(
         EngineSpec(
             name="dask",
-            summary="Workers of a Dask cluster, in a cloud or a queue: no shared folder is needed",
+            summary="Workers of a Dask cluster whose machines see the results folder",
             factory="qrlsuite.plugins.engines.dask:DaskEngine",
             options="qrlsuite.plugins.engines.dask:DaskOptions",
             extras={"distributed": "pip install 'qrlsuite[dask]'"},

@@ -21,14 +21,13 @@ import subprocess
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import pydantic
 from pydantic.dataclasses import dataclass
 
 from qrlsuite.engine.api import (
-    ONE_THREAD,
     Claim,
     EngineOutcome,
     EntryStore,
@@ -36,9 +35,10 @@ from qrlsuite.engine.api import (
     Show,
     Work,
     WorkerJob,
-    certain,
+    held,
     usable_cores,
     worker_command,
+    worker_environment,
 )
 from qrlsuite.errors import nearest
 
@@ -51,9 +51,6 @@ LOOK_SECONDS = 0.5
 
 PATIENCE = 60.0
 """Seconds for which workers that were asked to stop are waited for."""
-
-PASSED_ON = ("QRLSUITE_", "PYTHONPATH", "NUMBA_")
-"""Beginnings of the names of environment variables that a worker on another machine needs."""
 
 
 def _template(text: str) -> str:
@@ -124,13 +121,13 @@ class CommandEngine:
                     job.start(self.options.template, free.popleft())
                     running.append(job)
                 time.sleep(LOOK_SECONDS)
-                held = _held(job.work.store for job in running)
+                claims = held(job.work.store for job in running)
                 for job in list(running):
-                    if job.look(held):
+                    if job.look(claims):
                         continue
                     running.remove(job)
                     free.append(job.place)
-                    if job.ended(outcome):
+                    if job.command_ended(outcome):
                         waiting.append(job)
                 show({job.name: job.progress.read() for job in jobs})
         except BaseException:
@@ -157,8 +154,7 @@ class _CommandJob(WorkerJob):
             The number of the worker, from 1: the value of `{i}`.
         """
         self.place, self.begun, self._before = place, False, self.progress.read()
-        own = {name: value for name, value in os.environ.items() if name.startswith(PASSED_ON)}
-        words = ["env", *(f"{name}={value}" for name, value in sorted({**own, **ONE_THREAD}.items()))]
+        words = ["env", *(f"{name}={value}" for name, value in sorted(worker_environment().items()))]
         line = shell_line(template, [*words, *worker_command(self.work, self.group)], place, self.group.id)
         self.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the command has ended
         self.process = subprocess.Popen(
@@ -170,19 +166,10 @@ class _CommandJob(WorkerJob):
             start_new_session=True,  # Ctrl-C reaches the worker once, from here
         )
 
-    def claimed(self, held: Iterable[Claim]) -> bool:
-        """Return whether somebody trains seeds of the group."""
-        entry, seeds = self.work.store.path, set(self.group.seeds)
-        return any(claim.path.is_relative_to(entry) and seeds & set(claim.seeds) for claim in held)
-
-    def finished(self) -> bool:
-        """Return whether all seeds of the group are there."""
-        return self.work.store.finished(self.group.seeds, self.work.epochs) == set(self.group.seeds)
-
-    def look(self, held: Sequence[Claim]) -> bool:
+    def look(self, claims: Sequence[Claim]) -> bool:
         """Return whether the group is still being trained, or waits to be."""
         code = None if self.process is None else self.process.poll()
-        claimed = self.claimed(held)
+        claimed = self.claimed(claims)
         self.begun |= claimed
         if code is None:
             return True
@@ -191,8 +178,8 @@ class _CommandJob(WorkerJob):
         waits = code == 0 and not self.begun and self.progress.read() == self._before
         return claimed or waits
 
-    def ended(self, outcome: EngineOutcome) -> bool:
-        """Judge an ended worker; return whether to start it again, else record its end in the outcome."""
+    def command_ended(self, outcome: EngineOutcome) -> bool:
+        """Judge an ended command; return whether to start it again, else record its end in the outcome."""
         text, progress = self.take_output(), self.progress.read()
         code = 0 if self.process is None else self.process.returncode
         if self.finished():
@@ -211,25 +198,24 @@ class _CommandJob(WorkerJob):
         return False
 
 
-def _held(stores: Iterable[EntryStore]) -> list[Claim]:
-    return [claim for store in {store.path: store for store in stores}.values() for claim in certain(store)]
-
-
 def _stop(running: Sequence[_CommandJob]) -> None:
     """Ask every worker to save and end, and wait for it; end commands whose worker never began."""
     asked: dict[str, Claim] = {}
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
-        claims = _held(job.work.store for job in running)
-        held = {claim.token: claim for claim in claims if any(job.claimed([claim]) for job in running)}
-        for token in held.keys() - asked.keys():
-            held[token].request_stop()
-        asked |= held
+        claims = {
+            claim.token: claim
+            for claim in held(job.work.store for job in running)
+            if any(job.claimed([claim]) for job in running)
+        }
+        for token in claims.keys() - asked.keys():
+            claims[token].request_stop()
+        asked |= claims
         for job in running:
             job.begun |= job.claimed(asked.values())
             if not job.begun:
                 _signal(job, signal.SIGTERM)
-        if not held and all(job.process is None or job.process.poll() is not None for job in running):
+        if not claims and all(job.process is None or job.process.poll() is not None for job in running):
             break
         time.sleep(LOOK_SECONDS / 5)
     for job in running:

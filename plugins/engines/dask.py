@@ -1,7 +1,8 @@
-"""The engine `dask`: workers of a Dask cluster, which need no shared folder.
+"""The engine `dask`: workers of a Dask cluster, whose machines see the results folder.
 
-A task is one call of `qrlsuite.training.remote_task.work_on`: bytes go out and come back. Dask pickles its own message,
-in which the call is text that names the function; of an answer, the client accepts bytes only.
+A task is one call of `work`, which starts a group's worker beside the Dask worker and waits for it. All else is read
+from the results folder. Dask pickles its own message, in which the call is text that names the function; of a result,
+the client accepts bytes only.
 
 The scheduler is somebody else's (`scheduler`), or one on this machine for the time of the run. TLS is set up by Dask's
 own settings (`distributed.comm.tls` in its configuration, addresses that begin with `tls://`).
@@ -9,53 +10,69 @@ own settings (`distributed.comm.tls` in its configuration, addresses that begin 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib
+import json
 import logging
+import os
+import socket
+import subprocess
+import sys
+import tempfile
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import pydantic
 from pydantic.dataclasses import dataclass
 
 from qrlsuite.engine.api import (
-    MOST_BYTES,
-    Answer,
     EngineOutcome,
     EntryStore,
     Show,
     Work,
-    differing,
-    train_remotely,
+    WorkerJob,
+    held,
     usable_cores,
+    worker_command,
+    worker_environment,
 )
-from qrlsuite.errors import QrlSuiteError, listed
+from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.registry import words
 
 log = logging.getLogger("qrlsuite")
 
-CALL = "__import__('qrlsuite.training.remote_task', fromlist=['work_on']).work_on(task)"
-"""What a worker evaluates. A pickled function of ours would end a worker that cannot import it."""
+MODULE = "qrlsuite.plugins.engines.dask"
+CALL = (
+    f"__import__('{MODULE}', fromlist=['work']).work(*task) "
+    "if __import__('importlib.util').util.find_spec('qrlsuite') else b''"
+)
+"""What a Dask worker evaluates. A pickled function of ours would end a worker that cannot import it."""
 
 TASKS = 10
 """Tasks at a time, where no number of workers was asked for and the scheduler is somebody else's."""
 
-LOOK_SECONDS = 1.0
-"""Seconds between two looks at which workers there are, where nothing is sent."""
-
-SEND_SECONDS = 0.1
-"""Shorter if there are tasks to send: a new worker is registered before it gets a task."""
-
-POLL_SECONDS = 0.1
-"""Seconds between two looks at whether an answer has come."""
+LOOK_SECONDS = 0.2
+"""Seconds between two looks: of the client at its tasks, of a task at its process."""
 
 FETCH_SECONDS = 5.0
-"""For which an answer is fetched; one whose worker has died meanwhile is worked on again first."""
+"""For which a result is fetched; one whose Dask worker has died meanwhile is worked on again first."""
 
 PATIENCE = 15.0
 """Seconds without any worker before a message says so."""
+
+SAVE_SECONDS = 60.0
+"""Seconds for which workers that were told to stop are waited for."""
+
+IGNORE_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""For Dask workers on this terminal: Ctrl-C reaches the command, which ends them."""
+
+UNSEEN = -1000
+"""In the place of an exit code: the Dask worker does not see the folder."""
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -74,8 +91,50 @@ class DaskOptions:
     ] = 10.0
 
 
+def work(mark: str, arguments: Sequence[str], environment: Mapping[str, str]) -> bytes:
+    """Be a task: start a group's worker, and return its exit code and output.
+
+    The worker saves and ends when the task is canceled, which a client's end does too, or the Dask worker ends.
+
+    Parameters
+    ----------
+    mark:
+        A file of the client's, which a machine sees that shares the folder.
+    arguments:
+        The worker's command line after Python's own path, which is this machine's.
+    environment:
+        Variables that are set for it.
+    """
+    if not Path(mark).exists():
+        return json.dumps([UNSEEN, socket.gethostname()]).encode()
+    own = {**os.environ, **environment}
+    # set by Dask for its workers: each large array would be returned to the system, and cleared page by page again
+    own.pop("MALLOC_TRIM_THRESHOLD_", None)
+    dask_worker = _module("distributed").get_worker()
+    key = dask_worker.get_current_task()
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            [sys.executable, *arguments, "--follow-parent", str(os.getpid())],
+            env=own,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,  # Ctrl-C reaches the worker once, from here
+        )
+        told = False
+        while process.poll() is None:
+            task = dask_worker.state.tasks.get(key)
+            ends = dask_worker.status.name in ("closing", "closed", "failed")
+            if not told and (ends or task is None or task.state != "executing"):
+                process.terminate()
+                told = True
+            time.sleep(LOOK_SECONDS)
+        output.seek(0)
+        return json.dumps([process.returncode, output.read().decode(errors="replace").strip()]).encode()
+
+
 class DaskEngine:
-    """Carries tasks to the workers of a Dask cluster."""
+    """Starts workers by the tasks of a Dask cluster and follows them in the results folder."""
 
     def __init__(self, options: DaskOptions) -> None:
         self.options = options
@@ -89,195 +148,189 @@ class DaskEngine:
         return set()
 
     def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
-        """Send the groups of each work as tasks, and write the answers."""
-        return train_remotely(self, works, show)
+        """Train the groups until all have finished or failed."""
+        jobs = [WorkerJob(work, group, works) for work in works for group in work.groups]
+        for job in jobs:
+            job.progress.clear()
+        with self.connected(works[0].workers) as cluster, contextlib.ExitStack() as stack:
+            marks = {work.store.path: _mark(work.store, stack) for work in works}
+            try:
+                return self._follow(cluster, jobs, marks, works[0].workers, show)
+            except BaseException:
+                cluster.stop()
+                raise
 
-    def connect(self, workers: int, versions: Mapping[str, str | None]) -> DaskLink:
-        """Connect to the scheduler, or start one with as many workers on this machine."""
-        return DaskLink(self.options, workers, versions)
-
-
-class DaskLink:
-    """A connection to a Dask scheduler."""
-
-    def __init__(self, options: DaskOptions, workers: int, versions: Mapping[str, str | None]) -> None:
-        self._versions = versions
-        self._futures: dict[str, Any] = {}
-        self._allowed: dict[str, frozenset[str]] = {}
-        self._done_by: dict[str, frozenset[str]] = {}
-        self._unsent: list[str] = []
-        self._refused: dict[str, str] = {}
-        self._usable: frozenset[str] = frozenset()
-        self._looked, self._worker_seen = 0.0, time.monotonic()
-        self._exit = contextlib.ExitStack()
-        with self._exit as exit_stack:
-            quiet = {"distributed.admin.large-graph-warning-threshold": 2 * MOST_BYTES}
-            exit_stack.enter_context(_module("dask.config").set(quiet))
-            address = options.scheduler
+    @contextlib.contextmanager
+    def connected(self, workers: int) -> Iterator[Cluster]:
+        """Connect to the scheduler, or to one with as many workers that is started on this machine."""
+        with contextlib.ExitStack() as stack:
+            address = self.options.scheduler
             if address is None:
-                cluster = _module("distributed").LocalCluster(
+                local = _module("distributed").LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     host="127.0.0.1",
                     dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL,
+                    preload=[IGNORE_CTRL_C],
                 )
-                exit_stack.callback(cluster.close)
-                address = str(cluster.scheduler_address)
-            self.address = address
-            self._client = _connected(address, options.timeout)
-            exit_stack.callback(self._client.close)
-            self._require_version()
-            self._exit = exit_stack.pop_all()
+                stack.callback(_quietly, local.close)
+                address = str(local.scheduler_address)
+            client = _connected(address, self.options.timeout)
+            stack.callback(_quietly, client.close)
+            yield Cluster(client, address)
 
-    def _require_version(self) -> None:
-        """Refuse a scheduler whose Dask or Python is not ours."""
-        found = self._client.get_versions()
-        ours, theirs = found["client"]["packages"], found["scheduler"]["packages"]
-        here, there = (
-            {"distributed": p.get("distributed"), "python": _minor(p.get("python"))} for p in (ours, theirs)
-        )
-        if different := differing(here, there):
-            raise QrlSuiteError(
-                f"the Dask scheduler at {self.address} has {different}: Dask needs the same on both sides"
-            )
+    def _follow(
+        self, cluster: Cluster, jobs: Sequence[WorkerJob], marks: Mapping[Path, str], workers: int, show: Show
+    ) -> EngineOutcome:
+        """Keep as many tasks out as there are workers, until all groups have finished or failed."""
+        outcome, waiting, running, begun = EngineOutcome(), deque(jobs), cluster.running, set[str]()
+        while waiting or running:
+            claims = held(job.work.store for job in jobs)
+            begun |= {job.name for job in running if job.claimed(claims)}
+            for _ in range(len(waiting)):
+                job = waiting.popleft()
+                # a worker whose Dask worker was lost may still be saving
+                if len(running) < workers and not (job.name in begun and job.claimed(claims)):
+                    cluster.submit(job, marks[job.work.store.path])
+                else:
+                    waiting.append(job)
+            time.sleep(LOOK_SECONDS)
+            for job, code in cluster.ended():
+                lost = code == 3 and job.name in begun  # the seeds are still those of the worker before
+                if code == 0 and not job.finished():
+                    job.said("it ended, and this machine does not see all that it trained")
+                    code = 1
+                if lost or job.ended(code, outcome):
+                    waiting.append(job)
+            show({job.name: job.progress.read() for job in jobs})
+        return outcome
 
-    def send(self, key: str, task: bytes, priority: int) -> None:
-        """Have a task worked on by any worker of our versions."""
-        self._submit(key, task, priority)
 
-    def send_apart(self, key: str, task: bytes, priority: int, other: str) -> None:
-        """Have a task worked on by another worker than the one that answered `other`, if there is another."""
-        self._submit(key, task, priority, self._done_by.get(other, frozenset()))
+class Cluster:
+    """A Dask cluster, and the tasks that are out."""
 
-    def _submit(self, key: str, task: bytes, priority: int, but: frozenset[str] = frozenset()) -> None:
-        if time.monotonic() - self._looked >= SEND_SECONDS:
-            self._look()
-        if self._refused and not self._usable:
-            self._unsent.append(key)  # `receive` says so
-            return
-        allowed = self._usable if self._refused else frozenset[str]()
-        if but:
-            allowed = self._usable - but or allowed
-        restricted = {"workers": sorted(allowed)} if allowed else {}
-        self._allowed[key] = allowed
-        self._futures[key] = self._client.submit(
-            eval, CALL, {"task": task}, key=f"train-{key}", priority=priority, pure=False, **restricted
-        )
+    def __init__(self, client: Any, address: str) -> None:
+        self.client, self.address = client, address
+        self.running: dict[WorkerJob, Any] = {}
+        self._begun, self._looked = time.monotonic(), False
 
-    def receive(self, seconds: float) -> list[Answer]:
-        """Return the answers that have come, waiting for the first of them that long at most."""
-        deadline = time.monotonic() + seconds
-        while True:
-            if self._client.status not in ("running", "connecting"):
-                raise QrlSuiteError(
-                    f"the Dask scheduler at {self.address} is gone; finished epochs are kept, and the same command "
-                    "continues with another"
-                )
-            ended = [key for key, future in self._futures.items() if future.status != "pending"]
-            if ended or time.monotonic() >= deadline:
-                break
-            time.sleep(POLL_SECONDS)
-        answers = [answer for key in ended if (answer := self._fetch(key)) is not None]
-        lost = bool(self._unsent) or any(answer.content is None for answer in answers)
-        if lost or time.monotonic() - self._looked >= LOOK_SECONDS:
-            self._look()
-            answers += self._stranded()
-        return answers
-
-    def _fetch(self, key: str) -> Answer | None:
-        """Return the answer to an ended task, None where its bytes are on a worker that has just died."""
-        future = self._futures[key]
+    def submit(self, job: WorkerJob, mark: str) -> None:
+        """Have a group's worker started on a machine of the cluster."""
+        task = (mark, worker_command(job.work, job.group)[1:], worker_environment())
         try:
-            answer = Answer(key, _bytes(future.result(timeout=FETCH_SECONDS)))
-            self._done_by[key] = frozenset(next(iter(self._client.who_has([future]).values()), ()))
+            self.running[job] = self.client.submit(eval, CALL, {"task": task}, pure=False)
+        except (Exception, asyncio.CancelledError):  # the client has just noticed it
+            raise self._gone() from None
+
+    def _gone(self) -> QrlSuiteError:
+        return QrlSuiteError(
+            f"the Dask scheduler at {self.address} is gone; finished epochs are kept, and the same command "
+            "continues with another"
+        )
+
+    def ended(self) -> Iterator[tuple[WorkerJob, int]]:
+        """Yield the groups whose task has ended, with the exit code of the worker; 1 where the task was lost."""
+        if self.client.status not in ("running", "connecting"):
+            raise self._gone()
+        if not self._looked and time.monotonic() - self._begun > PATIENCE:
+            self._looked = True
+            with contextlib.suppress(Exception):  # it is gone, which the next look says
+                if not self.client.nthreads():
+                    log.warning(f"the Dask scheduler at {self.address} has no worker: waiting for one")
+        for job, future in [*self.running.items()]:
+            if future.status == "pending":
+                continue
+            try:
+                code, text = self._result(future)
+            except TimeoutError:
+                continue
+            del self.running[job]
+            if code == UNSEEN:
+                raise StoreError(
+                    f"the Dask worker on {text} does not see {job.work.store.path.absolute()}: share the results "
+                    "folder with the cluster, or repeat the command there without --engine, and take over its "
+                    "results here with `qrlsuite import FOLDER`"
+                )
+            job.said(text)
+            yield job, code
+
+    def _result(self, future: Any) -> tuple[int, str]:
+        """Return a worker's exit code and its output."""
+        try:
+            content = future.result(timeout=FETCH_SECONDS)
         except TimeoutError:
-            return None
+            raise
         except Exception as error:
-            answer = Answer(key, None, words(error))
+            return 1, words(error)
         except BaseException as error:  # asyncio's CancelledError is no Exception
             if isinstance(error, KeyboardInterrupt | SystemExit):
                 raise
-            answer = Answer(key, None, "the scheduler has forgotten it")
-        self._forget(key)
-        return answer
-
-    def _forget(self, key: str) -> None:
-        with contextlib.suppress(Exception):  # the scheduler may be gone
-            self._futures[key].cancel()
-        del self._futures[key], self._allowed[key]
-
-    def _look(self) -> None:
-        """See which workers there are, and which of them have our versions."""
-        self._looked = time.monotonic()
-        if self._client.status != "running":  # `receive` says when it is gone
-            return
-        with contextlib.suppress(OSError, TimeoutError):
-            there = frozenset(self._client.nthreads())
-            self._refused = {address: reason for address, reason in self._refused.items() if address in there}
-            if there - self._usable - self._refused.keys():
-                self._ask_versions(there)
-            self._usable = there - self._refused.keys()
-            if there:
-                self._worker_seen = self._looked
-        if self._looked - self._worker_seen > PATIENCE:
-            self._worker_seen = float("inf")
-            log.warning(f"the Dask scheduler at {self.address} has no worker: waiting for one")
-
-    def _stranded(self) -> list[Answer]:
-        """Return as lost the tasks that only workers that are gone may do."""
-        if self._refused and not self._usable:
-            reasons = [f"{address} has {reason}" for address, reason in sorted(self._refused.items())]
+            return 1, "the scheduler has forgotten it"
+        if content == b"":
             raise QrlSuiteError(
-                f"no worker of the Dask scheduler at {self.address} can be used: {listed(reasons, 3)}; install "
-                "the same versions there"
+                f"a worker of the Dask scheduler at {self.address} has no qrlsuite: install the same version there"
             )
-        gone = [key for key, allowed in self._allowed.items() if allowed and not allowed & self._usable]
-        for key in gone:
-            self._forget(key)
-        gone, self._unsent = gone + self._unsent, []
-        return [Answer(key, None, "the workers that could do it are gone") for key in gone]
+        code, text = json.loads(content)
+        return int(code), str(text)
 
-    def _ask_versions(self, there: frozenset[str]) -> None:
-        """Ask the workers for their versions, and note who has others than ours."""
-        names = [name for name in self._versions if name != "python"]
-        answers = self._client.get_versions(packages=names)["workers"]
-        for address in sorted(there & answers.keys() - self._usable):
-            packages = answers[address]["packages"]
-            found = {**packages, "python": _minor(packages.get("python"))}
-            different = differing(self._versions, found)
-            if different and address not in self._refused:
-                self._refused[address] = different
-                log.warning(f"worker {address} is left out: it has {different}")
+    def stop(self) -> None:
+        """Cancel the tasks, and wait until their workers have saved and ended."""
+        _quietly(self.client.cancel, [*self.running.values()])
+        deadline = time.monotonic() + SAVE_SECONDS
+        while time.monotonic() < deadline:
+            claims = held(job.work.store for job in self.running)
+            if not any(job.claimed(claims) for job in self.running):
+                return
+            time.sleep(LOOK_SECONDS)
 
-    def close(self) -> None:
-        """Cancel the tasks that have no answer yet, and disconnect."""
-        with contextlib.suppress(Exception):
-            self._client.cancel(list(self._futures.values()))
-        self._futures.clear()
-        with contextlib.suppress(Exception):  # there is nothing left to lose
-            self._exit.close()
+
+def _mark(store: EntryStore, stack: contextlib.ExitStack) -> str:
+    """Write a file in an entry's folder by which a machine knows the folder; removed at the end."""
+    try:
+        return stack.enter_context(
+            tempfile.NamedTemporaryFile(dir=store.path.absolute(), prefix="dask-")
+        ).name
+    except OSError as error:
+        raise StoreError(f"cannot write {store.path}: {error.strerror or error}") from None
 
 
 def _connected(address: str, timeout: float) -> Any:
-    """Return a client of the scheduler at an address."""
+    """Return a client of the scheduler at an address, whose Dask and Python are ours."""
     distributed = _module("distributed")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in our words
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
-            return distributed.Client(
+            client = distributed.Client(
                 address,
                 timeout=timeout,
                 set_as_default=False,
                 name="qrlsuite",
-                deserializers=["dask", "msgpack"],  # no pickle: an answer is bytes
+                deserializers=["dask", "msgpack"],  # no pickle: a result is bytes
             )
     except Exception as error:
         raise QrlSuiteError(
             f"no Dask scheduler answers at {address} within {timeout:g} s ({words(error)}): is it running there, and "
             "can this machine reach it?"
         ) from None
+    found = client.get_versions()
+    here, there = (_versions(found[side]["packages"]) for side in ("client", "scheduler"))
+    if here != there:
+        client.close()
+        different = listed(
+            [f"{name} {there[name]} instead of {here[name]}" for name in here if here[name] != there[name]]
+        )
+        raise QrlSuiteError(
+            f"the Dask scheduler at {address} has {different}: Dask needs the same on both sides"
+        )
+    return client
+
+
+def _versions(packages: Mapping[str, Any]) -> dict[str, str]:
+    """Return the versions that both sides need, of Python as `3.12` for Dask's `3.12.1.final.0`."""
+    python = ".".join(str(packages.get("python")).split(".")[:2])
+    return {"distributed": str(packages.get("distributed")), "python": python}
 
 
 def _module(name: str) -> Any:
@@ -285,12 +338,7 @@ def _module(name: str) -> Any:
     return importlib.import_module(name)
 
 
-def _minor(python: Any) -> str:
-    """Return `3.12` for Dask's `3.12.1.final.0`."""
-    return ".".join(str(python).split(".")[:2])
-
-
-def _bytes(content: object) -> bytes:
-    if not isinstance(content, bytes):
-        raise TypeError(f"a worker answered with {type(content).__name__} in the place of bytes")
-    return content
+def _quietly(function: Any, *arguments: Any) -> None:
+    """Call a function of Dask's where nothing is lost if the scheduler is gone."""
+    with contextlib.suppress(Exception, asyncio.CancelledError):
+        function(*arguments)

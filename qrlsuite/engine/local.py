@@ -5,16 +5,18 @@ A killed worker loses at most the work since its last checkpoint, and disturbs n
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import tempfile
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import IO
 
 from qrlsuite.engine.work import EngineOutcome, Show, Work, job_name, worker_command
+from qrlsuite.results.claims import Claim, certain
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
@@ -29,6 +31,9 @@ IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 """Environment variables of every worker: sums are added in the same order on any number of cores."""
 
+PASSED_ON = ("QRLSUITE_", "PYTHONPATH", "NUMBA_")
+"""Beginnings of the names of environment variables that a worker on another machine needs."""
+
 
 class WorkerJob:
     """A group of one of the works, the process that was started for it, and how often that died."""
@@ -40,6 +45,15 @@ class WorkerJob:
         self.process: subprocess.Popen[bytes] | None = None
         self.output: IO[bytes] | None = None
 
+    def claimed(self, claims: Iterable[Claim]) -> bool:
+        """Return whether somebody trains seeds of the group, by what `held` returned."""
+        entry, seeds = self.work.store.path, set(self.group.seeds)
+        return any(claim.path.is_relative_to(entry) and seeds & set(claim.seeds) for claim in claims)
+
+    def finished(self) -> bool:
+        """Return whether all seeds of the group are there."""
+        return self.work.store.finished(self.group.seeds, self.work.epochs) == set(self.group.seeds)
+
     def take_output(self) -> str:
         """Return the output of an ended process, and close its file."""
         if self.output is None or self.output.closed:
@@ -47,6 +61,10 @@ class WorkerJob:
         with self.output:
             self.output.seek(0)
             return self.output.read().decode(errors="replace").strip()
+
+    def said(self, text: str) -> None:
+        """Take the output of a process on another machine."""
+        self.output = io.BytesIO(text.encode())
 
     def died(self, reason: str, text: str) -> str | None:
         """Count a death; return why the group is given up, None if it is to be started again.
@@ -65,6 +83,33 @@ class WorkerJob:
             return None
         last = f": {text.splitlines()[-1]}" if text else ""
         return f"its worker died {ATTEMPTS} times ({reason}){last}\n{text}"
+
+    def ended(self, code: int, outcome: EngineOutcome) -> bool:
+        """Judge an ended worker; return whether to try again, else record its end in the outcome."""
+        text = self.take_output()
+        if code == 0:
+            return False
+        if code in (2, 3):
+            message = str(self.progress.read().get("error") or text or "failed").removeprefix("qrlsuite: ")
+            (outcome.failed if code == 2 else outcome.taken)[self.name] = message
+            return False
+        reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        given_up = self.died(reason, text)
+        if given_up is None:
+            return True
+        outcome.failed[self.name] = given_up
+        return False
+
+
+def held(stores: Iterable[EntryStore]) -> list[Claim]:
+    """Return the claims in the entries' folders whose holders are alive for certain."""
+    return [claim for store in {store.path: store for store in stores}.values() for claim in certain(store)]
+
+
+def worker_environment() -> dict[str, str]:
+    """Return the environment variables that a worker on another machine is given."""
+    own = {name: value for name, value in os.environ.items() if name.startswith(PASSED_ON)}
+    return {**own, **ONE_THREAD}
 
 
 def usable_cores() -> int:
@@ -110,7 +155,7 @@ class LocalEngine:
                     if code is None:
                         continue
                     self._running.remove(job)
-                    if _ended(job, code, outcome):
+                    if job.ended(code, outcome):
                         waiting.append(job)
                 show({job.name: job.progress.read() for job in jobs})
         except BaseException:
@@ -153,20 +198,3 @@ def _start(job: WorkerJob) -> None:
 def _ignore_warnings() -> None:
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
-
-
-def _ended(job: WorkerJob, code: int, outcome: EngineOutcome) -> bool:
-    """Judge an ended worker; return whether to try again, else record its end in the outcome."""
-    text = job.take_output()
-    if code == 0:
-        return False
-    if code in (2, 3):
-        message = str(job.progress.read().get("error") or text or "failed").removeprefix("qrlsuite: ")
-        (outcome.failed if code == 2 else outcome.taken)[job.name] = message
-        return False
-    reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-    given_up = job.died(reason, text)
-    if given_up is None:
-        return True
-    outcome.failed[job.name] = given_up
-    return False

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from qrlsuite.engine import remote
 from qrlsuite.engine.budget import Budget, seconds
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Where
-from qrlsuite.engine.work import EngineOutcome, Missing, RemoteEngine, Snapshot, raise_failures
+from qrlsuite.engine.work import EngineOutcome, Missing, Snapshot, raise_failures
 from qrlsuite.errors import FileError, OptionError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
@@ -55,8 +54,6 @@ def find(
     busy &= set(requested)
     left = sorted(set(requested) - busy)
     missing = plan_groups(store, left, last, where.workers)
-    if missing and isinstance(where.engine, RemoteEngine):
-        missing = plan_groups(store, left, last, where.workers, remote.seeds_per_task(entry))
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
 
 

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from safetensors.numpy import load, save
 
 from qrlsuite import own
 from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
@@ -42,7 +43,6 @@ from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
 from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord
 from qrlsuite.results.store import EntryStore, read_arrays
-from qrlsuite.training.remote_task import pack, unpack
 
 if TYPE_CHECKING:
     from qrlsuite.training.group import Part
@@ -66,6 +66,19 @@ class Side:
     lines: list[Mapping[str, Any]]
     arrays: Arrays
     changed: bool = False
+
+
+def pack(header: Mapping[str, Any], arrays: Arrays) -> bytes:
+    """Return the answer of the fresh process as bytes: a safetensors file with the header as JSON in its metadata."""
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    content: bytes = save(contiguous, metadata={"header": json.dumps(header)})
+    return content
+
+
+def unpack(content: bytes) -> tuple[dict[str, Any], Arrays]:
+    """Return header and arrays of a result of `pack`."""
+    length = int.from_bytes(content[:8], "little")
+    return json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["header"]), load(content)
 
 
 class Recorder:

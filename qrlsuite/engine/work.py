@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import Entry
@@ -126,71 +126,6 @@ class Engine(Protocol):
         """Train the groups, calling `show` with their progress now and then; or hand them over and return.
 
         Of all works together, as many groups at a time as `workers` of the first says. `job_name` names a group.
-        """
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The outcome of a task.
-
-    Attributes
-    ----------
-    key:
-        With which the task was sent.
-    content:
-        The result of `work_on`, None if the task was lost (its worker died, for example).
-    problem:
-        Why it was lost.
-    """
-
-    key: str
-    content: bytes | None
-    problem: str = ""
-
-
-class Link(Protocol):
-    """A connection to workers that call `qrlsuite.training.remote_task.work_on`."""
-
-    def send(self, key: str, task: bytes, priority: int) -> None:
-        """Have a task worked on by any worker, now or when one is free.
-
-        Parameters
-        ----------
-        key:
-            New for every task.
-        priority:
-            Tasks with a higher priority go first if possible; groups that have begun have a higher priority.
-        """
-
-    def receive(self, seconds: float) -> list[Answer]:
-        """Return the answers that have come, each once; waits for the first of them, that long at most."""
-
-    def close(self) -> None:
-        """Forget the tasks that have no answer yet, and disconnect."""
-
-
-@runtime_checkable
-class ChoosingLink(Link, Protocol):
-    """A link that can choose who works on a task: now and then, a second worker repeats what a first one did."""
-
-    def send_apart(self, key: str, task: bytes, priority: int, other: str) -> None:
-        """Have a task worked on by another worker than the one that answered the task `other`, if there is another."""
-
-
-@runtime_checkable
-class RemoteEngine(Engine, Protocol):
-    """An engine whose workers need no shared folder; its `run` returns `train_remotely(self, works, show)`."""
-
-    def connect(self, workers: int, versions: Mapping[str, str | None]) -> Link:
-        """Return a connection to workers.
-
-        Parameters
-        ----------
-        workers:
-            How many tasks will be sent at a time.
-        versions:
-            Required versions of distributions, and of `python`, on a worker. `work_on` refuses other versions; a link
-            that knows its workers' versions sends such a worker nothing.
         """
 
 

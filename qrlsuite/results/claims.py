@@ -19,7 +19,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -224,22 +224,8 @@ def _refreshed(claim: Claim) -> int | None:
 
 
 def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
-    """Claim seeds for this process."""
-    (claim,) = acquire_each(store, [seeds])
-    if isinstance(claim, SeedsClaimedError):
-        raise claim
-    return claim
-
-
-def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Claim | SeedsClaimedError]:
-    """Claim groups of seeds for this process, each group by itself; existing claims are read once for all groups.
-
-    Returns
-    -------
-    list
-        The claim of each group, or the error that `acquire` raises if a living worker holds one of its seeds.
-    """
-    wanted = {seed for seeds in groups for seed in seeds}
+    """Claim seeds for this process; raises a `SeedsClaimedError` where a living worker holds one of them."""
+    wanted = set(seeds)
     try:
         store.claims.mkdir(parents=True, exist_ok=True)
         with _locked(store.claims):
@@ -251,20 +237,16 @@ def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Cla
             for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:
                 path.unlink(missing_ok=True)
                 path.with_suffix(".stop").unlink(missing_ok=True)
-            held = {seed: holder for holder in holders for seed in holder.seeds}
-            return [_acquire_free(store, seeds, held) for seeds in groups]
+            for holder in holders:
+                if shared := wanted & set(holder.seeds):
+                    raise SeedsClaimedError(_refusal(holder, sorted(shared)))
+            return _write(store, seeds)
     except OSError as error:
         raise StoreError(f"cannot write {store.claims}: {cause(error)}") from None
 
 
-def _acquire_free(
-    store: EntryStore, seeds: Sequence[int], held: Mapping[int, Claim]
-) -> Claim | SeedsClaimedError:
-    """Write a claim of seeds, unless another claim holds one of the seeds."""
-    for seed in seeds:
-        if seed in held:
-            holder = held[seed]
-            return SeedsClaimedError(_refusal(holder, sorted(set(seeds) & set(holder.seeds))))
+def _write(store: EntryStore, seeds: Sequence[int]) -> Claim:
+    """Write a claim of seeds."""
     token = secrets.token_hex(8)
     claim = Claim(
         path=store.claims / f"{token}.json",

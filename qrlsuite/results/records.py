@@ -176,7 +176,7 @@ class Provenance(Record):
     """Versions and machine that trained a seed, see `qrlsuite.results.provenance`; never part of an identity.
 
     `instructions` are the variables that fixed instruction sets. `before` has the other records of a published seed's
-    earlier epochs. Records of remote workers have a `host`.
+    earlier epochs. Records of Dask workers that saw no results folder have a `host`.
     """
 
     versions: dict[str, str] = {}

@@ -86,23 +86,15 @@ def format_seeds(seeds: Sequence[int]) -> str:
     return f"{text}:{int(text) + 1}" if text.isdecimal() else text  # a lone number would count from 0
 
 
-def plan_groups(
-    store: EntryStore, seeds: Sequence[int], epochs: int, workers: int, largest: int = LARGEST_GROUP
-) -> list[SeedGroup]:
-    """Divide the unfinished seeds into groups: as many as workers, seeds at different epochs apart.
-
-    Parameters
-    ----------
-    largest:
-        Seeds of a group, at most.
-    """
+def plan_groups(store: EntryStore, seeds: Sequence[int], epochs: int, workers: int) -> list[SeedGroup]:
+    """Divide the unfinished seeds into groups: as many as workers, seeds at different epochs apart."""
     finished = store.finished(seeds, epochs)
     newest = checkpoint.latest(store)
     by_epoch: dict[int, list[int]] = {}
     for seed in sorted(set(seeds) - finished):
         by_epoch.setdefault(newest[seed].epoch if seed in newest else 0, []).append(seed)
     unfinished = sum(len(members) for members in by_epoch.values())
-    size = min(largest, LARGEST_GROUP, max(1, math.ceil(unfinished / max(1, workers))))
+    size = min(LARGEST_GROUP, max(1, math.ceil(unfinished / max(1, workers))))
     groups = []
     for epoch, members in sorted(by_epoch.items()):
         pieces = math.ceil(len(members) / size)

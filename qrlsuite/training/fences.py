@@ -47,7 +47,7 @@ def _moved(before: tuple[Any, Any, torch.Tensor], others_draw: bool) -> list[str
 
 
 def _other_threads() -> bool:
-    """Return whether other threads than the suite's run: a tracker's, or a Dask worker's."""
+    """Return whether other threads than the suite's run, such as a tracker's."""
     main = threading.main_thread()
     return any(thread is not main and thread.name != HEARTBEAT_THREAD for thread in threading.enumerate())
 

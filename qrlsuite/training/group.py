@@ -76,7 +76,7 @@ def timing_of(epoch: Epoch, seeds: int) -> TimingLine:
 
 
 class GroupFiles:
-    """The files of a group of seeds of an entry while it is trained, wherever that is done.
+    """The files of a group of seeds of an entry while it is trained.
 
     Parameters
     ----------
@@ -155,14 +155,6 @@ class GroupFiles:
             folder.write_record(record)
             history = [line.content for line in folder.epochs()] if self.events.heard("run_started") else []
             self.events.send("run_started", run=record.told(folder.path, history=history))
-
-    def add_origin(self, origin: Provenance) -> None:
-        """Note in `run.json` of every seed where else it is trained."""
-        for seed in self.seeds:
-            folder = self.store.seed(seed)
-            record = folder.record()
-            if record is not None and origin not in record.provenance:
-                folder.write_record(record.changed(provenance=_with_origin(record, origin)))
 
     def add_probe(self, probe: ProbeRecord) -> None:
         """Note a probe's result in `run.json` of every seed."""

@@ -69,7 +69,7 @@ def test_passes_of_copies_are_watched_too() -> None:
 
 
 def test_other_threads_may_draw() -> None:
-    """As those of a Dask worker do all the time; torch's generator they leave alone."""
+    """As those of a tracker may; torch's generator they leave alone."""
     ended = threading.Event()
     thread = threading.Thread(target=ended.wait)
     thread.start()

@@ -25,9 +25,7 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results import codes
 from qrlsuite.results.claims import acquire
-from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore, read_json, write_json
-from qrlsuite.training.remote_task import pack, unpack, work_on
 from tests.commands import qrlsuite, start_worker
 from tests.conftest import TINY, Train, install, installed
 from tests.leaderboard import boards
@@ -476,26 +474,6 @@ def test_seeds_are_set_aside_only_where_nobody_has_them(
     assert codes.set_aside(runs, store, now) == (taken, None)
     assert codes.set_aside(runs, store, now) == (None, None)
     assert EntryStore(taken).seeds() == [0, 1]
-
-
-def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> None:
-    entry = resolve(tiny_task, "mlp width=16")
-    parts = identity.of(entry).record()["parts"]
-    task = {
-        "token": "t",
-        "seeds": [0],
-        "epoch": 0,
-        "epochs": 1,
-        "seconds": 0,
-        "device": "cpu",
-        "versions": {},
-    }
-    task |= {"entry": EntryRecord.of(entry).content, "code": [{**parts[0], "numerics": 2}, *parts[1:]]}
-    answer, _ = unpack(work_on(pack(task, {})))
-    assert answer["refused"].endswith("has other code: environment 'beam6g' has numerics 1, and had 2")
-    answer, _ = unpack(work_on(pack({**task, "code": parts}, {})))
-    assert answer["refused"] is None
-    assert answer["provenance"]["numerics"] == {"environment": 1, "algorithm": 1, "model": 2}
 
 
 def test_what_somebody_trains_is_not_begun_with_other_code(

@@ -23,7 +23,6 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER
 from qrlsuite.studies.outcome import in_folder
-from qrlsuite.training.remote_task import pack, unpack, work_on
 from qrlsuite.training.trainer import Trainer, first_network
 from tests.conftest import cases
 
@@ -404,41 +403,6 @@ def test_a_published_study_imports_nothing() -> None:
     outcomes, (line,) = in_folder(Path("runs"))
     assert not outcomes
     assert "what lies beside results is not imported" in line
-
-
-def test_a_task_of_a_remote_worker_brings_its_plugins() -> None:
-    """Two versions of a file one after the other, as two users may send them; a path that leads out is refused."""
-    source = own.read(write("ring.py", RING))
-    entry_of = {}
-    for gate in ("RY", "RZ"):
-        own.load(write("ring.py", RING.replace('"RY"', f'"{gate}"')))
-        entry = resolve("beam6g", "vqc-native ansatz=ring qubits=2 layers=1")
-        packed = [each.packed() for each in identity.plugins(entry)]
-        entry_of[gate] = EntryRecord.of(entry).content, identity.of(entry).record()["parts"], packed
-    own.unload(own.loaded()[0])
-    for gate in ("RY", "RZ", "RY"):
-        record, parts, packed = entry_of[gate]
-        header = {
-            "token": "t",
-            "seeds": [0],
-            "versions": {},
-            "entry": record,
-            "code": parts,
-            "plugins": packed,
-        }
-        header |= {"epoch": 0, "epochs": 0, "seconds": 1, "device": "cpu"}
-        answer, _ = unpack(work_on(pack(header, {})))
-        assert (answer["refused"], answer["error"]) == (None, None)
-        assert gate in {each.gate for each in circuit.ansatz("ring", 2, 1)}
-    header["plugins"] = entry_of["RZ"][2]
-    assert (
-        "the circuit of ansatz 'ring' of ring.py has changed"
-        in unpack(work_on(pack(header, {})))[0]["refused"]
-    )
-    for name in ("../ring.py", "/etc/ring.py", "ring.py/../../x.py"):
-        evil = {"name": "ring.py", "files": {name: source.packed()["files"]["ring.py"]}}
-        answer = unpack(work_on(pack({**header, "plugins": [evil]}, {})))[0]
-        assert "no plugin that can be unpacked" in answer["refused"]
 
 
 @pytest.fixture

@@ -16,14 +16,12 @@ from qrlsuite.api.warm import begin_with
 from qrlsuite.engine import probe
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
-from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.boards import tables
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training.remote_task import POLICY, pack, unpack, versions, work_on
 from qrlsuite.training.trainer import Trainer
 from tests.commands import answer, say
 from tests.conftest import POLE, TINY, Train, trainer
@@ -152,18 +150,9 @@ def test_stopped_anywhere_and_in_any_company_it_ends_with_the_same_bytes(root: P
     assert files(cold, 0) != expected[0]
 
 
-def test_workers_without_a_shared_folder_and_the_probe_begin_alike(root: Path) -> None:
+def test_the_probe_begins_alike(root: Path) -> None:
     _, warm = stores(root)
     entry = warm.entry()
-    header: dict[str, Any] = {
-        "token": "t", "entry": EntryRecord.of(entry).content, "seeds": [0, 1], "epoch": 0, "epochs": 2, "seconds": 1e9,
-        "device": "cpu", "versions": versions(entry.distributions()), "code": identity.of(entry).parts, "plugins": [],
-    }  # fmt: skip
-    answer, arrays = unpack(work_on(pack(header, warm.initial([0, 1]))))
-    assert (answer["error"], answer["refused"]) == (None, None)
-    for seed in (0, 1):
-        own = warm.seed(seed).parameters()
-        assert all(np.array_equal(arrays[f"{POLICY}{name}"][seed], value) for name, value in own.items())
     side = probe.train(entry, [1], 2, start=warm.start_of(1))
     scores = warm.seed(1).epochs()[0].scores
     assert side.lines[0]["scores"] == scores

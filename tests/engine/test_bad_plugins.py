@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.engine.probe import Side, difference
-from qrlsuite.training.remote_task import unpack
+from qrlsuite.engine.probe import Side, difference, unpack
 from tests.conftest import HANGS, TINY, install, installed
 
 PLUGIN = """
@@ -56,10 +55,9 @@ ENVIRONMENTS: dict[str, str | None] = {
 SIDES = """
 import json, sys
 from pathlib import Path
-from qrlsuite.engine.probe import train
+from qrlsuite.engine.probe import pack, train
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.training.remote_task import pack
 out, seeds, cases = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 for name, (task, model) in cases.items():
     header, arrays = {"error": None}, {}

@@ -183,12 +183,3 @@ def test_what_needs_no_probe(acme: Acme, monkeypatch: pytest.MonkeyPatch) -> Non
     assert made is not None
     assert probe.prepare([(store.entry(), store, [3])], 3, "cpu") is None, "it is claimed"
     made.claim.release()
-
-
-def test_without_a_shared_folder_both_sides_are_trained_here(acme: Acme) -> None:
-    pytest.importorskip("distributed")
-    assert "probed: seed 1 is the same alone" in acme.run("good", "2", "--engine", "dask")
-    assert {record["result"] for record in acme.probes().values()} == {"equal"}
-    said = acme.run("class_attribute", "2", "--engine", "dask", runs="bad", code=2)
-    assert "seed 1 depends on its company" in said
-    assert not list((acme.folder / "bad").rglob("epochs.*")), "nothing was sent"

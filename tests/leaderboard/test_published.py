@@ -111,7 +111,7 @@ def test_writing_again_gives_the_same_bytes(folder: Path, trained: Path, tmp_pat
 
 
 def test_names_of_hosts_are_not_exported(runs: Path, tmp_path: Path) -> None:
-    """A remote worker's record has one, in the run and in what it replaced."""
+    """An older Dask worker's record has one, in the run and in what it replaced."""
     store = EntryStore(runs)
     for seed in store.seeds():
         record = store.seed(seed).record()
