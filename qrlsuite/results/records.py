@@ -52,17 +52,18 @@ def _sorted_once(names: list[Any]) -> list[Any]:
 
 
 Line = Annotated[str, AfterValidator(_one_line)]
-Count = Annotated[int, Field(strict=True, ge=0, lt=10**12)]
-Positive = Annotated[int, Field(strict=True, ge=1, lt=10**9)]
+Count = Annotated[int, Field(ge=0, lt=10**12)]
+Positive = Annotated[int, Field(ge=1, lt=10**9)]
 Name = Annotated[str, Field(pattern=specs.WHOLE_NAME)]
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Seconds = Annotated[float, Field(strict=True, ge=0, lt=1e12)]
+Word = Annotated[str, Field(pattern=r"^[A-Za-z_]\w{0,63}$")]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, lt=1e12)]
 
 
 class Record(pydantic.BaseModel):
     """A JSON object of a file; messages name its kind (`what`) and the remedy for a damaged one (`cure`)."""
 
-    model_config = pydantic.ConfigDict(frozen=True, populate_by_name=True)
+    model_config = pydantic.ConfigDict(frozen=True, populate_by_name=True, strict=True)
     what: ClassVar[str] = "a record"
     cure: ClassVar[str] = "restore the file"
     _content: dict[str, Any] = PrivateAttr(default_factory=dict)
@@ -452,7 +453,7 @@ class EpochLine(Record):
     epoch: Positive
     scores: Annotated[list[Number], Field(min_length=1)] | None = None
     score: Number | None = None
-    executions: dict[str, Annotated[int, Field(strict=True, ge=0, lt=2**63)] | None] | None = None
+    executions: dict[Word, Annotated[int, Field(ge=0, lt=2**63)] | None] | None = None
     diverged: bool | None = None
     measured: dict[Name, Number | None] = {}
 
@@ -465,11 +466,6 @@ class EpochLine(Record):
             if outer == MEASURED and dot and not specs.NAME.fullmatch(inner):
                 raise ValueError(f"{name!r} is not the name of a metric")
         return self
-
-    @property
-    def mean(self) -> float:
-        """The mean of the scores."""
-        return (self.score or 0.0) if self.scores is None else sum(self.scores) / len(self.scores)
 
 
 class TimingLine(Record):
@@ -499,7 +495,7 @@ class DecidedPair(Record):
     """Two entries of a study at a look, with their p and the decision, if any."""
 
     pair: list[str]
-    p: Annotated[float | None, Field(strict=True, ge=0, le=1)] = None
+    p: Annotated[float | None, Field(ge=0, le=1)] = None
     decided: str | None = None
 
 

@@ -148,7 +148,7 @@ def test_what_older_records_lack_has_a_meaning() -> None:
     assert (run.code_identity, run.probe, run.provenance, run.parameters) == (None, None, [], {})
     assert run.agent
     assert Provenance().device.kind == "cpu"
-    assert EpochLine.read({"epoch": 1, "scores": [0.5], "loss": 1e300}, LINES).mean == 0.5, (
+    assert EpochLine.read({"epoch": 1, "scores": [0.5], "loss": 1e300}, LINES).scores == [0.5], (
         "diverging is no damage"
     )
     with pytest.raises(
@@ -206,3 +206,9 @@ def test_what_no_entry_can_have_published(name: str, value: Any) -> None:
 def test_a_round_has_a_number_for_every_agent_and_lane(damage: dict[str, Any]) -> None:
     with pytest.raises(StoreError, match="is not a round of an evaluation"):
         RoundLine.read({**ROUND_CONTENT, **damage}, LINES)
+
+
+@pytest.mark.parametrize("damage", [{"diverged": "true"}, {"score": "0.5"}, {"executions": {"a b": 1}}])
+def test_a_text_is_no_other_value_and_executions_are_named_by_words(damage: dict[str, Any]) -> None:
+    with pytest.raises(StoreError, match="is not an epoch's record"):
+        EpochLine.read({**LINE_CONTENT, **damage}, LINES)
