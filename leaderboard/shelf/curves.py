@@ -317,6 +317,10 @@ class EntryResults(Shown):
         """Return the entry with a mark behind its name and its label, unless it has one."""
         return self if self.mark else replace(self, mark=mark)
 
+    def labeled(self, label: str) -> EntryResults:
+        """Return the entry with a label of your own, for pictures and tables."""
+        return replace(self, record=self.record.model_copy(update={"label": label}))
+
     def reaching(self, epochs: int) -> EntryResults | None:
         """Return the entry with the seeds that have reached some epochs, itself where all have; None for none."""
         lengths = set(self._lengths)

@@ -61,7 +61,8 @@ def test_a_record_that_names_other_files_is_refused(folder: Path) -> None:
         record["plugins"] = {code: [place] for code in record["plugins"]}
         path.write_text(json.dumps(record))
         said = run(folder, plugin=str(entry), code=2)
-        assert f"{place!r}: no copy of a plugin; restore the file" in said
+        assert place[:20] in said
+        assert "no copy of a plugin; restore the file" in said
     assert not (folder / "it-ran").exists()
     run(folder, "--seeds", "3", code=2)
 
