@@ -180,7 +180,7 @@ Writer = Callable[[SeedStore], None]
 def unite(
     store: EntryStore, source: Path | str, offered: Mapping[int, tuple[NDArray[np.float64], Writer | None]]
 ) -> tuple[list[int], list[int], list[int], list[str]]:
-    """Put seeds into an entry's folder that it lacks, or that are longer than there.
+    """Put seeds into an entry's folder that it lacks, or that are longer than there; no agent is lost by that.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def unite(
         The seeds that were put there; the seeds that were there already and stay, and those among them with another
         curve there; and notes.
     """
-    new, known, differing, waiting = list[int](), list[int](), list[int](), list[int]()
+    new, known, differing, waiting, bare = (list[int]() for _ in range(5))
     present = set(store.seeds())
     for seed, (curve, write) in offered.items():
         own = store.seed(seed).read().curve if seed in present else curve[:0]
@@ -203,9 +203,10 @@ def unite(
         if not np.array_equal(own[:shared], curve[:shared]):
             differing.append(seed)
         elif write is not None and (seed not in present or len(own) < len(curve)):
-            _place(store, seed, write)
-            new.append(seed)
-            continue
+            if _place(store, seed, write):
+                new.append(seed)
+                continue
+            bare.append(seed)
         elif seed not in present:
             waiting.append(seed)
             continue
@@ -216,6 +217,8 @@ def unite(
             f"seeds {format_seeds(differing)} have other curves in {source} than in {store.path}: these stay, until "
             "`qrlsuite runs rm` removes the entry"
         )
+    if bare:
+        notes.append(f"seeds {format_seeds(bare)} are longer in {source}, without their agents: these stay")
     if waiting:
         notes.append(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
@@ -223,13 +226,19 @@ def unite(
     return new, known, differing, notes
 
 
-def _place(store: EntryStore, seed: int, write: Writer) -> None:
-    """Put a seed into its place, whole or not at all; an existing seed stays until the new one is whole."""
+def _place(store: EntryStore, seed: int, write: Writer) -> bool:
+    """Put a seed into its place, whole or not at all; an existing seed stays until the new one is whole.
+
+    A seed without an agent does not replace one that has an agent: False.
+    """
     place = store.seed(seed).path
     made, aside = (place.with_name(f".{place.name}{end}") for end in (".import", ASIDE))
     try:
         shutil.rmtree(made, ignore_errors=True)
         write(SeedStore(made, seed))
+        if store.seed(seed).agent.exists() and not SeedStore(made, seed).agent.exists():
+            shutil.rmtree(made, ignore_errors=True)
+            return False
         if place.exists():
             shutil.rmtree(aside, ignore_errors=True)
             place.rename(aside)
@@ -241,6 +250,7 @@ def _place(store: EntryStore, seed: int, write: Writer) -> None:
         store.seeds()  # puts the old seed back
         shutil.rmtree(made, ignore_errors=True)
         raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
+    return True
 
 
 def _of_runs(

@@ -183,6 +183,19 @@ def test_a_seed_that_goes_on_there_is_taken_over(copied: EntryStore, elsewhere: 
     assert (again.new, again.known, again.notes) == ((), (0, 1), ()), "the longer curve stays"
 
 
+def test_a_longer_seed_without_an_agent_takes_none_away(
+    copied: EntryStore, elsewhere: Path, tmp_path: Path
+) -> None:
+    here = take(elsewhere, tmp_path / "runs").store.seed(1)
+    before = files(here.path)
+    train_group(copied.path, [1], 3)
+    copied.seed(1).agent.unlink()
+    done = import_seeds.import_seeds(copied, tmp_path / "runs")
+    assert (done.new, done.known) == ((), (0, 1))
+    assert done.notes[0].endswith("without their agents: these stay")
+    assert files(here.path) == before
+
+
 @pytest.mark.parametrize("renames", range(3))
 def test_a_killed_replacement_loses_no_seed(
     renames: int, copied: EntryStore, elsewhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
