@@ -13,6 +13,8 @@ import pytest
 from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
+from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.studies.looks import StudyWithLooks, new
@@ -122,3 +124,8 @@ def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], ru
     table = tab.locator("#beside-1 tbody")
     assert table.locator("tr").count() == 2
     assert "model-0 width=1" in table.locator("tr").first.inner_text()
+
+
+def test_published_studies_are_shown_with_the_boards_of_their_task(tmp_path: Path) -> None:
+    found, refused = published_studies.collected(Selection(tmp_path, published=True, tasks=("pulse",)))
+    assert ([outcome.study.name for outcome in found], refused) == (["equal-size-pulse"], [])
