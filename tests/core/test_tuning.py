@@ -90,6 +90,7 @@ def test_a_search_that_was_stopped_ends_with_the_same_preset(tiny_task: str, tmp
     wanted = request(tiny_task)
     straight = search.Search(wanted, tmp_path / "straight")
     finish(straight)
+    assert [trial.number for trial in straight.trials] == [1, 2, 3, 4], "every combination"
     with pytest.raises(KeyboardInterrupt):
         finish(search.Search(wanted, tmp_path / "stopped"), stop_before=2)
     resumed = search.Search(wanted, tmp_path / "stopped")
