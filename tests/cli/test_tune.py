@@ -64,6 +64,8 @@ def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path)
     assert "wrote " in rest
     repeated = say(*words, "--budget", "0.01s").stdout
     assert "the budget is spent" not in repeated, "no finished trial is left out of the preset"
+    whole = say(*words[:-1], str(tmp_path / "whole"), "--budget", "10min").stdout
+    assert "the budget is spent" not in whole, "three trials take seconds"
 
 
 def test_what_trials_keep_is_said_and_can_be_freed(
