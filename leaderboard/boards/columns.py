@@ -101,7 +101,7 @@ def _guarded(title: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def require_new(columns: Iterable[Column[Any]], taken: Iterable[str]) -> None:
-    """Refuse columns of plugins that others have the name of."""
+    """Refuse columns of plugins whose name another column has."""
     names = set(taken)
     for column in columns:
         if names & set(column.heads):
@@ -132,7 +132,7 @@ def estimate(
     write:
         Writes each of them.
     flat:
-        What spreadsheets call low and high.
+        Heads of low and high in spreadsheets.
     more:
         Of the number's column.
     """

@@ -315,7 +315,7 @@ def unequal_tuning(section: Section) -> list[str]:
 
 
 def _tuning_text(tuning: Mapping[str, Any], preset: str | None) -> str:
-    """Return the budget of an entry's tuning as far as it is known: `7 trials, 0.12 core-hours`.
+    """Return the known budget of an entry's tuning: `7 trials, 0.12 core-hours`.
 
     A preset's own note comes first: the settings may have been found for another size of the model.
     """

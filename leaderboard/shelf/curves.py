@@ -217,7 +217,7 @@ class EntryResults(Shown):
 
     @property
     def networks(self) -> int | None:
-        """The networks that `parameters` are summed over, all that are trained.
+        """Number of trained networks, over which `parameters` are summed.
 
         None in records of older versions, which counted the first alone, see `first_network_alone`.
         """
@@ -247,7 +247,7 @@ class EntryResults(Shown):
 
     @property
     def hours(self) -> float:
-        """Core-hours spent on the seeds, those that were left out too."""
+        """Core-hours spent on all seeds, left-out ones too."""
         return float(np.sum([run.hours for run in self.records.values()]))
 
     @property

@@ -154,7 +154,7 @@ class PublishedEntry:
         return EntryResults.of(self.record, self.folder, runs, chosen_seeds=self.chosen_seeds)
 
     def run(self, row: int) -> SeedRun:
-        """Return one seed as it is read from a results folder; its `scores` are the means."""
+        """Return one seed in the form of a results folder; its `scores` are the means."""
         seed, said = self.seeds[row], self.published
         diverged = said.diverged.get(str(seed))
         record = RunRecord.model_construct(

@@ -60,7 +60,7 @@ LOOK_SECONDS = 0.2
 """Seconds between two looks: of the client at its tasks, of a task at its process."""
 
 FETCH_SECONDS = 5.0
-"""For which a result is fetched; one whose Dask worker has died meanwhile is worked on again first."""
+"""Seconds for which a result is fetched; if its Dask worker has died, the task runs again first."""
 
 PATIENCE = 15.0
 """Seconds without any worker before a message says so."""

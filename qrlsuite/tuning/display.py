@@ -40,7 +40,7 @@ class TuneDisplay:
         self._said: set[str] = set()
 
     def begin(self) -> None:
-        """Print the size of each search, and its cost as far as it is known."""
+        """Print the size of each search, and its cost if known."""
         total: tuple[float, float] | None = (0.0, 0.0)
         bases: dict[str, None] = {}
         for search in self.searches:
