@@ -63,7 +63,7 @@ for _package, _modules in WHERE_INSTALLED.items():
 PENNYLANE, QISKIT = "qrlsuite.plugins.circuits.pennylane", "qrlsuite.plugins.circuits.qiskit"
 LOADED_FOR = {"vqc-pennylane": (PENNYLANE,), "check": (PENNYLANE, QISKIT), "pytest": (PENNYLANE, QISKIT)}
 """What is imported before the first command with this word, for it and all that follow."""
-HANGS = 3600
+HANGS = 1200
 """Seconds after which a command is taken to hang: far more than any needs on a busy machine."""
 
 # Tests kill processes, which loses no written byte; nothing cuts the power.

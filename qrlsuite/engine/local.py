@@ -20,6 +20,7 @@ from qrlsuite.results.claims import Claim, certain
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
+from qrlsuite.training.interrupts import Interruptible
 
 ATTEMPTS = 3
 """Deaths of a group's worker, without a finished epoch between them, before the group is given up."""
@@ -142,22 +143,26 @@ class LocalEngine:
             job.progress.clear()
         pause = 0.01  # grows until another job begins, so that a short run is seen to end at once
         try:
-            while waiting or self._running:
-                while waiting and len(self._running) < works[0].workers:
-                    job = waiting.popleft()
-                    self._running.append(job)
-                    _start(job)
-                    pause = 0.01
-                time.sleep(pause)
-                pause = min(1.5 * pause, 0.2)
-                for job in list(self._running):
-                    code = job.process.poll() if job.process else None
-                    if code is None:
-                        continue
-                    self._running.remove(job)
-                    if job.ended(code, outcome):
-                        waiting.append(job)
-                show({job.name: job.progress.read() for job in jobs})
+            with Interruptible() as guard:
+                while waiting or self._running:
+                    with (
+                        guard.deferred()
+                    ):  # a fork loses exceptions, and a process without a name is not stopped
+                        while waiting and len(self._running) < works[0].workers:
+                            job = waiting.popleft()
+                            self._running.append(job)
+                            _start(job)
+                            pause = 0.01
+                    time.sleep(pause)
+                    pause = min(1.5 * pause, 0.2)
+                    for job in list(self._running):
+                        code = job.process.poll() if job.process else None
+                        if code is None:
+                            continue
+                        self._running.remove(job)
+                        if job.ended(code, outcome):
+                            waiting.append(job)
+                    show({job.name: job.progress.read() for job in jobs})
         except BaseException:
             self.stop()
             raise

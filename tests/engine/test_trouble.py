@@ -112,6 +112,33 @@ def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> N
         assert [row.epoch for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 7))
 
 
+INTERRUPTED_AT_A_FORK = """
+import os, signal, traceback
+import torch
+sent = []
+def send():
+    if not sent and "_start" in {frame.name for frame in traceback.extract_stack()}:
+        sent.append(os.kill(os.getpid(), signal.SIGTERM))
+os.register_at_fork(after_in_parent=send)  # Python loses an exception that is raised here
+class Unused(torch.nn.Module):
+    def __init__(self, n_inputs, n_outputs):
+        super().__init__()
+"""
+
+
+def test_an_interruption_while_a_worker_is_being_started_stops_the_run(
+    words: list[str], tmp_path: Path
+) -> None:
+    plugin = tmp_path / "plugin.py"
+    plugin.write_text(INTERRUPTED_AT_A_FORK)
+    run = start("--plugin", str(plugin), *words, "--epochs", "100000", "--runs", str(tmp_path / "runs"))
+    try:
+        assert run.wait(HANGS) == 130
+    finally:
+        if run.returncode is None:
+            run.kill()
+
+
 @pytest.fixture
 def entry(kept: Train) -> EntryStore:
     return EntryStore(kept("runs", [0], 1))
