@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.engine.terminal import command
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
 from qrlsuite.results import codes, probes
 from qrlsuite.results.records import Provenance
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import Arrays, EntryStore, SeedRun, parameters_of
 
 
@@ -54,7 +56,8 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     kept = _agents(store, entry) if agents else {}
     if kept and not force and _add_agents(folder, entry, store, kept):
         return folder
-    _refuse_smaller(folder, entry, force)
+    if folder.exists() and not force:
+        _require_all_seeds(folder, entry)
     runs = [store.seed(seed).read() for seed in entry.seeds]
     unfinished = [run.seed for run in runs if not run.finished]
     if unfinished:
@@ -148,21 +151,23 @@ def _distinct(origins: Iterable[Provenance]) -> list[Provenance]:
     return [Provenance.model_validate(json.loads(text)) for text in texts]
 
 
-def _refuse_smaller(folder: Path, entry: EntryResults, force: bool) -> None:
-    if force or not folder.exists():
-        return
+def _require_all_seeds(folder: Path, entry: EntryResults) -> None:
+    """Refuse to replace a published entry by results that lack some of its seeds or epochs."""
     try:
-        before = published.read(folder)
-    except StoreError as error:
-        raise QrlSuiteError(f"{error}; --force replaces it") from None
-    if len(before.seeds) > len(entry.seeds) or before.curves.shape[1] > entry.curves.shape[1]:
-        if before.record.name == entry.folder.name.partition("@")[0] != entry.folder.name:
-            raise QrlSuiteError(
-                f"{entry.folder} holds seeds of another code than those exported to {folder}: --out another folder"
-            )
+        there = published.read(folder).entry_results()
+        union = entry + there
+    except (OptionError, StoreError) as error:
+        raise QrlSuiteError(f"{error}; --force replaces {folder}, --out writes to another folder") from None
+    lacking = [
+        seed for seed, run in union.records.items() if seed not in entry.seeds or run.epochs > entry.epochs
+    ]
+    if lacking:
+        runs = str(entry.folder.parents[1])
+        adding = f"`{command('import', str(folder), '--runs', runs)}` adds them"
+        held = set(lacking) <= entry.records.keys()
         raise QrlSuiteError(
-            f"{folder} has {len(before.seeds)} seeds of {before.curves.shape[1]} epochs, "
-            f"and '{entry.label}' {len(entry.seeds)} of {entry.curves.shape[1]}; --force replaces it"
+            f"{folder} has epochs of seeds {format_seeds(lacking)} that would not be in the new files: "
+            f"{'train all seeds to the same number of epochs' if held else adding}; --force replaces {folder}"
         )
 
 

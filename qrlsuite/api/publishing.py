@@ -125,9 +125,7 @@ def export(
             written += 1
             yield Exported(entry, folder)
     if not written:
-        raise QrlSuiteError(
-            f"{runs} holds no complete entry: qrlsuite runs --runs {runs} lists what it holds"
-        )
+        raise QrlSuiteError(f"no entry was exported: qrlsuite runs --runs {runs} lists those of {runs}")
 
 
 def _is_study(name: str) -> bool:

@@ -28,7 +28,7 @@ from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards import board, costs
 from qrlsuite.leaderboard.boards.compared import compare_entries
-from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
+from qrlsuite.leaderboard.shelf import collect, import_seeds, plausible, published, verify
 from qrlsuite.leaderboard.shelf.curves import edited_between
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
@@ -124,15 +124,22 @@ def test_names_of_hosts_are_not_exported(runs: Path, tmp_path: Path) -> None:
     assert '"host"' not in text
 
 
-def test_a_smaller_entry_replaces_a_larger_one_only_by_force(
+def test_published_seeds_are_replaced_by_a_union_or_by_force(
     folder: Path, train: Train, tmp_path: Path
 ) -> None:
-    few = train("few", range(2), EPOCHS)
-    with pytest.raises(QrlSuiteError, match=r"has 8 seeds of 3 epochs.*--force"):
-        publish(few, tmp_path / "entries")
-    assert len(published.read(folder).seeds) == 8
-    publish(few, tmp_path / "entries", force=True)
-    assert len(published.read(folder).seeds) == 2
+    few, out = train("few", range(6, 10), EPOCHS), tmp_path / "entries"
+    with pytest.raises(QrlSuiteError, match=r"has epochs of seeds 0:6 .* import .*few` adds them; --force"):
+        publish(few, out)
+    import_seeds.import_seeds(EntryStore(folder), few.parents[1])
+    assert published.read(publish(few, out)).seeds == tuple(range(10))
+    rewrite(folder / "curves.parquet", put("score", 0, 0.125))
+    with pytest.raises(
+        QrlSuiteError, match=r"seed 0 has one curve in .* and another in .*; --force replaces"
+    ):
+        publish(few, out)
+    shorter = train("shorter", range(2), EPOCHS)
+    publish(shorter, out, force=True)
+    assert published.read(folder).seeds == (0, 1)
 
 
 def test_the_beginning_of_a_seed_does_not_depend_on_its_company(folder: Path) -> None:
@@ -560,7 +567,7 @@ def test_commands(folder: Path, trained: Path, tmp_path: Path) -> None:
     assert "export all" in refused("export", "--runs", runs)
     (tmp_path / "none").mkdir()
     said = refused("export", "all", "--runs", tmp_path / "none")
-    assert "holds no complete entry: qrlsuite runs --runs" in said
+    assert "no entry was exported: qrlsuite runs --runs" in said
 
 
 def test_an_entry_is_verified_from_inside_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,7 +39,7 @@ def export(
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace an entry with more seeds or epochs.")
+        bool, typer.Option("--force", help="Replace an entry with other seeds or more epochs.")
     ] = False,
     without_agents: Annotated[
         bool, typer.Option("--no-agents", help="Write curves alone, without the trained agents.")
