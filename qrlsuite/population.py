@@ -505,6 +505,12 @@ class Adam:
         tensors (S,). A population's factors multiply them (`learning_rates`).
     betas, eps:
         Adam's constants.
+
+    Attributes
+    ----------
+    rates:
+        Learning rates by parameter name: of all agents, or float64 tensors (S,). Every step reads them, so that an
+        algorithm may change them while it trains.
     """
 
     def __init__(
@@ -519,10 +525,10 @@ class Adam:
         self._named = [(name, p) for name, p in population.named_parameters() if p.requires_grad]
         if not self._named:
             raise ValueError("a population without trainable parameters has nothing to optimize")
-        self._lr = {name: quantum_lr if name in quantum else classical_lr for name, _ in self._named}
-        for name, factor in factors.items():
-            if name in self._lr:
-                self._lr[name] = self._lr[name] * factor
+        self.rates = {
+            name: (quantum_lr if name in quantum else classical_lr) * factors.get(name, 1.0)
+            for name, _ in self._named
+        }
         self._quantum = quantum
         self.betas = betas
         self.eps = eps
@@ -553,7 +559,7 @@ class Adam:
             if parameter.grad is None:
                 continue
             axes = (-1, *[1] * (parameter.dim() - 1))
-            rate = (self._lr[name] * scale).to(parameter).view(axes)
+            rate = (self.rates[name] * scale).to(parameter).view(axes)
             correction = root.to(parameter).view(axes)
             mean, square = self.mean[name], self.square[name]
             if active is None:
@@ -582,6 +588,8 @@ class Adam:
         from qrlsuite.compiled.perceptron import joined
 
         _, block, means, squares, sizes, rates, constants = self._blocks
+        for row, (name, _) in zip(rates, self._named):
+            row[:] = self.rates[name]
         counts = self.steps.tolist()
         scale: Any
         if counts.count(counts[0]) == len(counts):
@@ -600,7 +608,7 @@ class Adam:
         return True
 
     def _lay_out(self, parameters: Sequence[Tensor]) -> tuple[Any, ...]:
-        """Return where parameters are; they and both moments, each in one block; sizes and learning rates."""
+        """Return where parameters are; they and both moments, each in one block; sizes, and room for learning rates."""
         from qrlsuite.compiled.perceptron import in_one_block, joined
 
         self.mean, self.square = (
@@ -609,8 +617,7 @@ class Adam:
         moments = [list(own.values()) for own in (self.mean, self.square)]
         for part in (parameters, *moments):
             in_one_block(part)
-        lr = [torch.as_tensor(self._lr[name], dtype=torch.float64).numpy() for name, _ in self._named]
-        rates = np.stack([np.broadcast_to(each, len(self.steps)) for each in lr])
+        rates = np.empty((len(parameters), len(self.steps)))
         sizes = np.array([p[0].numel() for p in parameters])
         blocks = (joined(part) for part in (parameters, *moments))
         beta1, beta2 = self.betas

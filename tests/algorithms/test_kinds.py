@@ -101,7 +101,7 @@ def test_heads_of_circuits(tmp_path: Path) -> None:
         "quantum": 18,
         "networks": 3,
     }
-    rates = trainer.algorithm.actor_adam._lr
+    rates = trainer.algorithm.actor_adam.rates
     assert rates["output.weight"] == pytest.approx(100 * rates["circuit.weights"])
 
 

@@ -95,15 +95,18 @@ def test_what_is_not_finite_stays_with_its_seed() -> None:
     assert all(g[[0, 2]].isfinite().all() for g in gradients)
 
 
-def test_adam_is_torchs_and_leaves_agents_that_rest_alone() -> None:
+@pytest.mark.parametrize("compiled", [True, False])
+def test_adam_is_torchs_reads_its_rates_and_leaves_agents_that_rest_alone(compiled: bool) -> None:
     population = torch.nn.Module()
     population.w = torch.nn.Parameter(torch.randn(3, 5, 7))
-    population.compiled = True
+    population.compiled = compiled
     other = population.w.detach().clone().requires_grad_(True)
     ours, theirs = Adam(population, 0.01, 0.01), torch.optim.Adam([other], 0.01)
-    for _ in range(5):
+    for rate in (0.01, 0.01, 0.003, 0.001, 0.02):
         gradient = torch.randn(3, 5, 7)
         population.w.grad, other.grad = gradient, gradient.clone()
+        theirs.param_groups[0]["lr"] = rate
+        ours.rates["w"] = rate if rate > 0.001 else torch.full((3,), rate, dtype=torch.float64)
         ours.step()
         theirs.step()
     torch.testing.assert_close(population.w.detach(), other.detach(), rtol=1e-5, atol=1e-6)
