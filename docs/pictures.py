@@ -33,7 +33,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture that a command draws from published entries: into `--out`, or a study's under its own name.
+    """A picture that a command draws from published entries.
 
     Attributes
     ----------
@@ -98,46 +98,49 @@ PICTURES: dict[str, Picture] = {
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
-    "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
-    "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
-    "study-shots-costs.png": Unpublished("study run shots --seeds 20 --epochs 30"),
-    "study-shots-curves.png": Unpublished("study run shots --seeds 20 --epochs 30"),
+    "study-deploy-errors.png": Unpublished("plot errors --study deploy"),  # `study run deploy --seeds 20`
+    "study-deploy-shots.png": Unpublished("plot shots --study deploy"),
+    "study-shots-costs.png": Unpublished(
+        "plot costs --study shots"
+    ),  # `study run shots --seeds 20 --epochs 30`
+    "study-shots-curves.png": Unpublished("plot curves --study shots"),
     "study-ablation-layers.png": Plot(
-        "study draw ablation layers --published --seeds 20",
+        "plot layers --study ablation --published --seeds 20",
         ("entries/beam6g/ddqn-vqc-native-*", "unranked/beam6g/ddqn-vqc-native-*"),
     ),
     "study-antennas-scaling.png": Plot(
-        "study draw antennas --published --seeds 20", ("unranked/beam6g-a?-?/*",)
+        "plot scaling --study antennas --published --seeds 20", ("unranked/beam6g-a?-?/*",)
     ),
     "study-degree-scaling.png": Plot(
-        "study draw degree --published --seeds 20", ("entries/beam6g/*", "entries/beam6g-degree[456]/*")
+        "plot scaling --study degree --published --seeds 20",
+        ("entries/beam6g/*", "entries/beam6g-degree[456]/*"),
     ),
     "study-fidelity-text.png": Plot(
-        "study draw fidelity text --published",
+        "plot text --study fidelity --published",
         ("unranked/beam6g/*",),
     ),
-    "study-fig1-surface.png": Plot("study draw fig1 --published --seeds 30", ("entries/beam6g/*",)),
-    "study-fig6-bars.png": Plot("study draw fig6 --published --seeds 30", ("entries/beam6g/*",)),
-    "study-fig7-scaling.png": Plot("study draw fig7 --published --seeds 30", ("entries/beam6g/*",)),
+    "study-fig1-surface.png": Plot("plot surface --study fig1 --published --seeds 30", ("entries/beam6g/*",)),
+    "study-fig6-bars.png": Plot("plot bars --study fig6 --published --seeds 30", ("entries/beam6g/*",)),
+    "study-fig7-scaling.png": Plot("plot scaling --study fig7 --published --seeds 30", ("entries/beam6g/*",)),
     **{
         f"study-quantum-or-not-{kind}.png": Plot(
-            "study draw quantum-or-not", ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
+            f"plot {kind} --study quantum-or-not", ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
         )
         for kind in ("pairs", "entries")
     },
     "study-larger-batch-entries.png": Plot(
-        "study draw larger-batch", ("plans/larger-batch", "plans/larger-batch/beam6g/*")
+        "plot entries --study larger-batch", ("plans/larger-batch", "plans/larger-batch/beam6g/*")
     ),
     "study-equal-size-tasks.png": Plot(
-        "study draw equal-size-beam6g equal-size-beam6g-degree5 equal-size-beam6g-a3-0 equal-size-cartpole "
-        "equal-size-frozenlake equal-size-vqe-h2 equal-size-pulse",
+        "plot pairs --study equal-size-beam6g --study equal-size-beam6g-degree5 --study equal-size-beam6g-a3-0 "
+        "--study equal-size-cartpole --study equal-size-frozenlake --study equal-size-vqe-h2 --study equal-size-pulse",
         ("plans/equal-size-*", "plans/equal-size-*/*/*"),
     ),
     "study-equal-size-ppo-tasks.png": Plot(
-        "study draw equal-size-beam6g-ppo equal-size-cartpole-ppo",
+        "plot pairs --study equal-size-beam6g-ppo --study equal-size-cartpole-ppo",
         ("plans/equal-size-*-ppo", "plans/equal-size-*-ppo/*/*"),
     ),
-    "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
+    "study-ppo-bars.png": Plot("plot bars --study ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
     "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),
     "episode-vqe.png": Plot("plot episode seed=2 --task vqe-ising", ()),
 }
@@ -244,12 +247,9 @@ def main(chosen: Sequence[str]) -> None:
 
 def _run(command: str, out: Path) -> None:
     """Run a command of the suite, which sees published entries and no runs of its user."""
-    runs, of_study = out.parent / "runs", command.startswith("study draw ")
-    place = ["--runs", str(runs), *([] if of_study else ["--out", str(out)])]
+    place = ["--runs", str(out.parent / "runs"), "--out", str(out)]
     words = [sys.executable, "-m", "qrlsuite", *shlex.split(command), *place]
     subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-    if of_study:
-        (runs / out.name).rename(out)
 
 
 def _mark(made: Path, mark: str, place: Path) -> None:

@@ -1,91 +1,39 @@
-"""Draws the pictures of a study from its entries in a results folder."""
+"""Studies: found by name, their entries read for boards, and their pictures."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import options, registry, specs
-from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.engine.terminal import command
+from qrlsuite.engine.work import Missing
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.times import rank_by_time
+from qrlsuite.leaderboard.pictures.compose import Composed, compose
 from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.store import EntryStore, write_atomically
-from qrlsuite.results.text import counted
+from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.studies.looks import StudyWithLooks, has_begun
 from qrlsuite.studies.outcome import StudyOutcome
-from qrlsuite.studies.runner import PendingEntry
-from qrlsuite.studies.study import Member, PictureSection, Study, load
+from qrlsuite.studies.runner import Overview
+from qrlsuite.studies.study import EvaluationSection, Member, PictureSection, Study, load
 from qrlsuite.studies.together import StudiesTogether
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Report = Callable[[str, int, int], None]
-NOTHING = "nothing is trained yet"
 PLAYED = ("episodes", "deployed")
 """Data of pictures for which trained agents play."""
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A picture of a study, or why there is none.
-
-    Attributes
-    ----------
-    seeds:
-        Seeds that each point rests on: (task, label, number) in the study's order, 0 where nothing is there yet.
-    short:
-        Entries that have begun but end before the others do, (task, label, epochs): they would cut the picture
-        to their length, and are left out.
-    figure:
-        None where the finished seeds do not suffice for the picture.
-    problem:
-        Then the reason.
-    path:
-        The picture's file, where it was written to one.
-    """
-
-    name: str
-    kind: str
-    seeds: tuple[tuple[str, str, int], ...]
-    short: tuple[tuple[str, str, int], ...] = ()
-    figure: Figure | None = None
-    problem: str = ""
-    path: Path | None = None
-
-    def lines(self) -> list[str]:
-        """Say where it was written and on how many seeds each point rests; nothing where nothing is trained yet."""
-        if self.path is None:
-            return [] if self.problem == NOTHING else [f"no picture '{self.name}': {self.problem}"]
-        several = len({task for task, _, _ in self.seeds}) > 1
-        epochs = {(task, label): count for task, label, count in self.short}
-        labels: dict[str, list[str]] = {}
-        for task, label, count in sorted(self.seeds, key=lambda point: -point[2]):
-            begun = epochs.get((task, label))
-            state = f"left out, at epoch {begun}" if begun else "nothing yet"
-            state = counted(count, "seed") if count else state
-            labels.setdefault(state, []).append(f"{task} {label}" if several else label)
-        return [f"wrote {self.path}", *(f"  {state}: {', '.join(names)}" for state, names in labels.items())]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {
-            "picture": self.name,
-            "kind": self.kind,
-            "file": None if self.path is None else str(self.path),
-            "problem": self.problem or None,
-            "seeds": [{"task": task, "label": label, "seeds": count} for task, label, count in self.seeds],
-            "short": [{"task": task, "label": label, "epochs": count} for task, label, count in self.short],
-        }
+OF_LOOKS = ("pairs", "entries")
+"""Pictures of a study with looks, which its file need not name."""
 
 
 def find(name: str) -> Study:
@@ -154,13 +102,13 @@ def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryResults]:
     return next(iter(collect.by_code(curves for curves in found if curves is not None)), [])
 
 
-def published_seeds(items: Iterable[PendingEntry]) -> dict[str, int]:
+def published_seeds(works: Iterable[Missing]) -> dict[str, int]:
     """Return how many seeds of each entry come with the suite and reach its last epoch, by entry name."""
     counts = {}
-    for item in items:
-        copies = _copies(published.folders(), item.missing.entry)
-        reached = [long for copy in copies if (long := copy.reaching(item.missing.epochs)) is not None]
-        counts[item.missing.entry.name] = max((len(copy.seeds) for copy in reached), default=0)
+    for work in works:
+        copies = _copies(published.folders(), work.entry)
+        reached = [long for copy in copies if (long := copy.reaching(work.epochs)) is not None]
+        counts[work.entry.name] = max((len(copy.seeds) for copy in reached), default=0)
     return counts
 
 
@@ -216,137 +164,95 @@ def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
 
 
 def draw(
-    study: Study,
-    members: Sequence[Member],
+    kind: str,
+    names: Sequence[str],
     selection: Selection,
-    report: Report | None = None,
-    seeds: str | None = None,
-) -> list[Drawn]:
-    """Draw every picture of a study from the seeds finished so far.
+    *,
+    horizon: int | None = None,
+    seeds: int | str | Iterable[int] | None = None,
+    settings: Mapping[str, Any],
+) -> Composed:
+    """Draw a picture of a study: its entries, with the settings of its file; of studies with looks the pairs, too.
 
     Parameters
     ----------
-    selection:
-        Pictures that play episodes show entries of the results folder alone.
-    seeds:
-        Draw these alone, of every entry (`20`, `0:20`), so that all have equal numbers; None means all. Pictures that
-        play episodes choose among all seeds, and are not drawn.
-    report:
-        Told of the progress of episodes that a picture needs: policy, played, total.
+    kind:
+        The name of a picture in the study's file, or a kind of picture: `pairs` or `entries` with looks.
+    names:
+        A study, or for `pairs` several with looks, each of another task.
+    selection, horizon, seeds, settings:
+        As for `qrlsuite.leaderboard.pictures.compose.compose`. Agents that play are those of the results folder.
     """
-    check(study)
-    own = read(Selection(selection.runs), members)  # those who can play: agents are not published
-    curves_by_name = read(selection, members) if selection.published else own
-    if seeds is not None:
-        curves_by_name = {name: entry.with_seeds(seeds) for name, entry in curves_by_name.items()}
-    drawn = []
-    for picture in study.file.pictures:
-        shown = [m for m in members if not picture.entries or m.group in picture.entries]
-        unique = {member.entry.name: member for member in shown}
-        kind = pictures.KINDS[picture.kind]
-        known = own if kind.data in PLAYED else curves_by_name
-        present = [known[name] for name in unique if name in known]
-        longest = max((_steps(entry) for entry in present), default=0)
-        entries = [entry for entry in present if _steps(entry) == longest]
-        counts = {entry.name: len(entry.seeds) for entry in entries}
-        head = Drawn(
-            picture.name,
-            picture.kind,
-            tuple((m.entry.task.name, m.entry.label, counts.get(name, 0)) for name, m in unique.items()),
-            tuple((e.task, e.label, e.curves.shape[1]) for e in present if _steps(e) < longest),
-        )
-        if not entries:
-            drawn.append(dataclasses.replace(head, problem=NOTHING))
-        elif seeds is not None and kind.data in PLAYED:
-            drawn.append(
-                dataclasses.replace(head, problem="it plays the best agents of all seeds: leave --seeds out")
+    name, *more = names
+    study = find(name)
+    named = {section.name: section for section in study.file.pictures}
+    if kind not in named and kind in OF_LOOKS and study.file.looks is not None:
+        if settings or seeds is not None or horizon is not None:
+            raise OptionError(
+                f"picture '{kind}' of a study shows its looks as they are: leave the settings out"
             )
-        else:
-            drawn.append(_attempt(picture, entries, head, report))
-    return drawn
+        return _of_looks(kind, names, selection.runs)
+    if kind not in named and kind not in pictures.KINDS:
+        known = [*named, *(OF_LOOKS if study.file.looks is not None else ()), *pictures.KINDS]
+        raise UnknownNameError(f"study '{study.name}' has no picture '{kind}'{nearest(kind, known)}")
+    if more:
+        raise OptionError(f"picture '{kind}' shows one study: leave {', '.join(more)} out")
+    section = named.get(kind) or PictureSection(kind=kind)
+    members = [
+        member
+        for member in study.members()
+        if (not section.entries or member.group in section.entries)
+        and (not selection.tasks or member.entry.task.name in selection.tasks)
+    ]
+    data = pictures.KINDS[section.kind].data
+    if data == "episodes":
+        raise OptionError(f"picture '{kind}' is drawn by: {drawn_by(name, section, members, selection.runs)}")
+    folder = selection.runs if study.file.looks is None else read_outcome(name, selection.runs).study.folder
+    entries = list(read(Selection(folder, selection.published and data == "entries"), members).values())
+    if not entries:
+        hint = "; --published draws the entries that come with the suite"
+        hint *= not selection.published and data == "entries"
+        raise UnknownNameError(f"study '{study.name}' has no seeds yet: qrlsuite study run {name}{hint}")
+    entries, short = collect.equally_long(entries)
+    if data == "deployed":
+        drawn = Composed(_deployed(section, entries), tuple(entries))
+    else:
+        own = {**section.settings, **settings}
+        drawn = compose(
+            section.kind, selection.of(), entries, horizon=horizon, seeds=seeds, settings=own, environment={}
+        )
+    return dataclasses.replace(drawn, left_out=(*drawn.left_out, *short))
 
 
-def draw_outcome(outcome: StudyOutcome) -> list[Drawn]:
-    """Draw the pairs and the entries of a study with looks, and the pictures that its file names."""
-    from qrlsuite.leaderboard.pictures import outcome as drawing
-
-    study = Study(outcome.study.file, outcome.study.source)
-    own = draw(study, study.members(), Selection(outcome.study.folder)) if study.file.pictures else []
-    figures = {"pairs": drawing.draw(outcome), "entries": drawing.draw_entries(outcome)}
-    return [*(Drawn(name, name, (), figure=figure) for name, figure in figures.items()), *own]
+def next_steps(name: str, found: Overview, runs: Path) -> list[str]:
+    """Return a line for each picture of a study: the command that draws it."""
+    return [f"next: {drawn_by(name, picture, found.members, runs)}" for picture in found.study.file.pictures]
 
 
-def draw_together(together: StudiesTogether) -> list[Drawn]:
-    """Draw the pairs that several studies with looks compare, task by task."""
-    from qrlsuite.leaderboard.pictures import outcome as drawing
-
-    return [Drawn("tasks", "tasks", (), figure=drawing.draw_together(together))]
-
-
-def write(name: str, pictures_: Iterable[Drawn], runs: Path, format_: str) -> list[Drawn]:
-    """Write the pictures of a study that could be drawn into the results folder.
-
-    Parameters
-    ----------
-    format_:
-        `png`, `pdf` or `svg`.
-    """
-    written = []
-    for drawn in pictures_:
-        if drawn.figure is not None:
-            path = runs / f"study-{name}-{drawn.name}.{format_}"
-            write_atomically(path, pictures.encode(drawn.figure, format_))
-            drawn = dataclasses.replace(drawn, path=path)
-        written.append(drawn)
-    return written
+def drawn_by(name: str, section: PictureSection, members: Sequence[Member], runs: Path) -> str:
+    """Return the command that draws a picture of a study."""
+    if pictures.KINDS[section.kind].data != "episodes":
+        return command("plot", section.name, "--study", name, runs=runs)
+    shown = [m.entry for m in members if not section.entries or m.group in section.entries]
+    labels, played = dict.fromkeys(entry.label for entry in shown), section.evaluation or EvaluationSection()
+    numbers = ("--best", str(played.best), "--episodes", str(played.episodes))
+    out = f"{section.name}.png"
+    return command("evaluate", *labels, "--task", shown[0].task.name, *numbers, "--out", out, runs=runs)
 
 
-def _steps(entry: EntryResults) -> int:
-    return int(entry.curves.shape[1]) * entry.steps_per_epoch
+def _of_looks(kind: str, names: Sequence[str], runs: Path) -> Composed:
+    """Draw the pairs or the entries of studies with looks."""
+    from qrlsuite.leaderboard.pictures import outcome as drawing  # matplotlib
+
+    outcomes = [read_outcome(name, runs) for name in names]
+    if len(outcomes) > 1 and kind != "pairs":
+        raise OptionError(f"picture '{kind}' shows one study: leave {', '.join(names[1:])} out")
+    if len(outcomes) > 1:
+        return Composed(drawing.draw_together(StudiesTogether(tuple(outcomes))))
+    return Composed(drawing.draw(outcomes[0]) if kind == "pairs" else drawing.draw_entries(outcomes[0]))
 
 
-def _attempt(
-    picture: PictureSection, entries: Sequence[EntryResults], head: Drawn, report: Report | None
-) -> Drawn:
-    """Draw one picture; the finished seeds may not suffice for it."""
-    try:
-        if pictures.KINDS[picture.kind].data == "episodes":
-            figure = _episodes(picture, entries, report)
-        elif pictures.KINDS[picture.kind].data == "deployed":
-            figure = _deployed(picture, entries, report)
-        else:
-            figure = pictures.draw(picture.kind, entries, **picture.settings)
-    except QrlSuiteError as error:
-        return dataclasses.replace(head, problem=str(error))
-    return dataclasses.replace(head, figure=figure)
-
-
-def _episodes(picture: PictureSection, entries: Sequence[EntryResults], report: Report | None) -> Figure:
-    """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
-    assert picture.evaluation is not None  # `check` saw to it
-    from qrlsuite.leaderboard.pictures import cells  # matplotlib, which is needed for drawing alone
-
-    cells.one_task(entries, picture.kind)
-    from qrlsuite.training import evaluation  # torch, which most pictures do without
-
-    best, episodes = picture.evaluation.best, picture.evaluation.episodes
-    stores = [EntryStore(entry.folder) for entry in entries]
-    more: Mapping[str, Any] = {} if report is None else {"report": report}
-    played = [evaluation.trained(store, best, episodes, **more) for store in stores]
-    played += evaluation.references(stores[0].entry(), episodes, **more)
-    values = {each.name: each.returns if each.seeds else each.returns[0] for each in played}
-    chosen = min(len(each.seeds) for each in played if each.seeds)
-    settings = {
-        "quantity": "sum of rewards over an episode",
-        "title": entries[0].task,
-        "note": f"agents: the {chosen} best runs by last validation score; episodes: fresh, the same for all policies",
-        **picture.settings,
-    }
-    histogram: Callable[..., Figure] = specs.resolve(f"{pictures.KINDS[picture.kind].module}:draw")
-    return histogram(values, **settings)
-
-
-def _deployed(picture: PictureSection, entries: Sequence[EntryResults], report: Report | None) -> Figure:
+def _deployed(picture: PictureSection, entries: Sequence[EntryResults]) -> Figure:
     """Play the entries' best runs as trained, and runs with a circuit on the backend at every value.
 
     Episodes on the backend are stored in the entries' folders, and not played again.
@@ -361,21 +267,20 @@ def _deployed(picture: PictureSection, entries: Sequence[EntryResults], report: 
     from qrlsuite.training.deployment import Deployment
 
     best, episodes, where = picture.evaluation.best, picture.evaluation.episodes, picture.evaluation.deployed
-    more: Mapping[str, Any] = {} if report is None else {"report": report}
     lines = []
     for entry in entries:
         store = EntryStore(entry.folder)
-        trained = evaluation.trained(store, best, episodes, **more)
+        trained = evaluation.trained(store, best, episodes)
         elsewhere = []
         if getattr(store.entry().model_options, "backend", None) is not None:
             for value in where.values:
                 deployment = Deployment(store, where.backend, where.chosen(value), best)
                 if not deployment.simulator:
                     raise OptionError(
-                        f"{deployment.name} is no simulator: a study executes nothing on hardware; use `qrlsuite "
+                        f"{deployment.name} is no simulator: a picture executes nothing on hardware; use `qrlsuite "
                         "evaluate` with --yes"
                     )
-                elsewhere.append(deployment.play(episodes, 0, **more))
+                elsewhere.append(deployment.play(episodes, 0))
         lines.append(drawing.Line(trained, tuple(elsewhere)))
     from qrlsuite.leaderboard.pictures import style
 

@@ -61,7 +61,7 @@ KINDS: dict[str, Picture] = {
         "episode sums against optimal and random (qrlsuite evaluate)", f"{_HERE}.histogram", data="episodes"
     ),
     "deployed": Picture(
-        "scores of trained agents with shots or noise (studies)", f"{_HERE}.deployed", data="deployed"
+        "scores of trained agents with shots or noise (plot --study)", f"{_HERE}.deployed", data="deployed"
     ),
 }
 """Pictures by name."""

@@ -80,7 +80,7 @@ def compose(
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
     if data == "deployed":
-        raise OptionError(f"picture '{kind}' is drawn by: qrlsuite study run deploy")
+        raise OptionError(f"picture '{kind}' is drawn by: qrlsuite plot shots --study deploy")
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
     selection = written.named()

@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qrlsuite.api.arguments import Seeds
+from qrlsuite.api.arguments import Seeds, several
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import rules, studies
 from qrlsuite.leaderboard.boards import across
@@ -19,7 +19,7 @@ from qrlsuite.leaderboard.boards.compared import EntryComparison, compare_entrie
 from qrlsuite.leaderboard.boards.costs import UNITS
 from qrlsuite.leaderboard.boards.pair import on_board
 from qrlsuite.leaderboard.boards.times import ALPHA
-from qrlsuite.leaderboard.pictures.compose import compose
+from qrlsuite.leaderboard.pictures.compose import Composed, compose
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -294,6 +294,7 @@ def plot(
     *,
     task: str | Sequence[str] | None = None,
     entries: Sequence[str | EntryResults] = (),
+    study: str | Sequence[str] = (),
     horizon: int | None = None,
     seeds: Seeds | None = None,
     runs: str | PathLike[str] = "runs",
@@ -312,6 +313,8 @@ def plot(
         Kind of picture, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
     task, entries, horizon, runs, published:
         As for `board`. Without `entries` all of the task are drawn, the smallest model first.
+    study:
+        Draw a picture that a study's file names, or its entries; of studies with looks also `pairs` and `entries`.
     seeds:
         Draw these alone, of every entry (30: seeds 0 to 29), so that all have equal numbers; entries that lack one are
         left out. None means all.
@@ -340,10 +343,11 @@ def plot(
     """
     if "tasks" in settings:
         raise OptionError(f"plot takes `task`, one or several: write task={settings['tasks']!r}")
-    drawn = compose(
+    drawn = draw_picture(
         kind,
         Selection.create(runs, task, published),
         entries,
+        several(study),
         horizon=horizon,
         seeds=seeds,
         settings=settings,
@@ -352,6 +356,23 @@ def plot(
     for line in drawn.left_out:
         warnings.warn(f"left out: {line}", stacklevel=2)
     return drawn.figure
+
+
+def draw_picture(
+    kind: str,
+    selection: Selection,
+    entries: Sequence[str | EntryResults],
+    of_studies: Sequence[str],
+    **settings: Any,
+) -> Composed:
+    """Draw a picture of entries, studies or a task's environment, as `plot` and its command do."""
+    if not of_studies:
+        return compose(kind, selection, entries, **settings)
+    if entries or settings.pop("environment"):
+        raise OptionError(
+            f"--study {of_studies[0]} names the entries and their tasks: leave --entry and environment.NAME out"
+        )
+    return studies.draw(kind, of_studies, selection.named(), **settings)
 
 
 def _family(shown: Sequence[EntryResults], ranked: Sequence[EntryResults]) -> list[EntryResults]:

@@ -123,6 +123,7 @@ def train(
     budget: str | None = None,
     confirmed: bool = True,
     code: CodeIdentity | None = None,
+    began: float | None = None,
 ) -> EngineOutcome:
     """Train the planned groups, showing progress; return how it ended.
 
@@ -134,8 +135,10 @@ def train(
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
     code:
         The entry's, where `require_same_code` has just returned it; None computes it and refuses another one.
+    began:
+        When the budget began, by `time.monotonic`; None is now.
     """
-    began, limit = time.monotonic(), seconds(budget, where.workers)
+    began, limit = time.monotonic() if began is None else began, seconds(budget, where.workers)
 
     def show(snapshot: Snapshot) -> None:
         display.update(snapshot)

@@ -334,13 +334,17 @@ tune mlp --task tiny.toml --sampler 'random trial=3' => did you mean 'trials'
 study run fig66 => unknown study 'fig66'; did you mean 'fig6'
 study run gone.toml => study file gone.toml cannot be read
 study run fig6 --budget soon => write 90s, 30min, 8h
-study run fig6 --budget 0.2s => cannot hold one group
+study run fig6 --budget 8h --engine slurm => --budget: engine 'slurm' leaves its tasks in a queue
 study run fig6 --engine lokal => did you mean 'local'
 study run fig6 --seeds a:b => write a number (100)
 study run fig6 vqc-native=vqc-nativ => unknown model 'vqc-nativ'; did you mean 'vqc-native'
 study run fig6 nothing => study 'fig6' has no such entry
-study draw fig6 => nothing is trained yet: qrlsuite study run fig6
-study draw fig6 --format gif => --format gif
+plot bars --study fig6 => study 'fig6' has no seeds yet: qrlsuite study run fig6
+plot barz --study fig6 => study 'fig6' has no picture 'barz'; did you mean 'bars'
+plot bars --study fig6 --entry mlp => --study fig6 names the entries
+plot bars --study fig6 --study fig7 => picture 'bars' shows one study: leave fig7 out
+plot histogram --study fig8 => drawn by: qrlsuite evaluate 'ddqn mlp width=64' 'ddqn vqc-native qubits=14' --task beam6g
+plot entries --study memory --study quantum-or-not => picture 'entries' shows one study
 study end fig6 => study 'fig6' has no looks
 study new p.toml --task tiny.toml mlp => a study with looks needs two or more entries
 study new p.toml --task tiny.toml mlp 'mlp width=4' 'ddqn mlp width=4' => entries.1 and entries.2 are the same

@@ -392,9 +392,7 @@ def test_any_study_with_a_table_of_looks_compares_its_entries() -> None:
     kept = Path("runs/decisions/grid/plan.toml").read_text()
     assert "epochs = 20" in kept
     assert kept.count("hash = ") == 2, "what was compared is written out where it began"
-    drawn = answer("study", "draw", "grid.toml")["pictures"]
-    assert [picture["picture"] for picture in drawn] == ["pairs", "entries", "picture"]
-    assert all(Path(picture["file"]).exists() for picture in drawn)
+    assert len(answer("plot", "picture", "--study", "grid.toml")["seeds"]) == 2
 
 
 def test_a_changed_study_is_refused_once_it_began(refused: Refused) -> None:
@@ -545,10 +543,12 @@ def test_a_study_may_ask_about_some_pairs_only() -> None:
 
 def test_pictures_have_a_row_for_each_pair_and_each_entry(refused: Refused) -> None:
     study = ask()
-    assert "widths has taken no look yet: there is nothing to draw" in refused("study", "draw", study)
+    assert "widths has taken no look yet: there is nothing to draw" in refused(
+        "plot", "pairs", "--study", study
+    )
     run(study)
-    drawn = say("study", "draw", study, "--format", "svg").stdout
-    assert drawn == "wrote runs/study-widths-pairs.svg\nwrote runs/study-widths-entries.svg\n"
+    for kind in ("pairs", "entries"):
+        assert say("plot", kind, "--study", study).stdout == f"wrote runs/study-widths-{kind}.png\n"
     outcome = studies.read_outcome(study, Path("runs"))
     figure = drawing.draw(outcome)
     [axes] = figure.axes

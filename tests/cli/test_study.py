@@ -1,10 +1,11 @@
-"""Studies at work: every one runs at a small budget and gives its pictures; budgets, sharing, interruptions."""
+"""Studies at work: each is trained and drawn; order, budgets, sharing, interruptions."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+import shlex
 import signal
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,11 +23,9 @@ from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.studies import find
 from qrlsuite.results import speed
-from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec, StudySpec
-from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check_budget, find_pending, fitting
-from qrlsuite.studies.study import parse
+from qrlsuite.studies.runner import find_missing
 from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, results
 from tests.core.test_study import EXPECTED
@@ -157,18 +156,21 @@ def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
     seeds = 2
     words = [reduced(name, tmp_path), "--seeds", str(seeds), "--epochs", "2"]
     words += ["--engine", "here", "--runs", str(tmp_path / "runs")]
+    said = say("study", "run", *words).stdout
     content = answer("study", "run", *words)
     assert content["core_hours_left"] == 0
-    assert all(entry["finished"] == seeds and entry["basis"] == "measured" for entry in content["entries"])
-    assert (
-        content["trained"] == seeds * len(content["entries"]) == sum(len(group) for _, group in Here.trained)
+    assert all(entry["finished"] == seeds for entry in content["entries"])
+    assert seeds * len(content["entries"]) == sum(len(group) for _, group in Here.trained), (
+        "nothing is trained twice"
     )
-    assert len(content["pictures"]) >= 1
-    for picture in content["pictures"]:
-        assert picture["problem"] is None, picture
-        assert Path(picture["file"]).read_bytes().startswith(b"\x89PNG")
-        assert all(point["seeds"] == seeds for point in picture["seeds"])
-    assert answer("study", "run", *words, "--dry-run")["steps"] == [], "nothing is trained twice"
+    assert said.count("next: ") >= 1
+    for place, line in enumerate(said.splitlines()):
+        _, *command = shlex.split(line.removeprefix("next: "))
+        picture = tmp_path / f"{place}.png"
+        few = ["--episodes", "5"] if command[0] == "evaluate" else []
+        drawn = answer(*command, *few, "--out", str(picture))
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert few or set(drawn["seeds"].values()) == {seeds}
 
 
 DEPLOYED = """
@@ -179,7 +181,7 @@ summary = "Trained agents elsewhere"
 [[entries]]
 name = "all"
 task = "TASK"
-model = ["vqc-native", "mlp"]
+model = ["vqc-native qubits=2 layers=1", "mlp"]
 
 [[pictures]]
 kind = "deployed"
@@ -195,16 +197,16 @@ def test_agents_of_a_study_act_on_a_backend_once(tmp_path: Path) -> None:
     (tmp_path / "tiny.toml").write_text(TINY)
     path, runs = tmp_path / "there.toml", tmp_path / "runs"
     path.write_text(DEPLOYED.replace("TASK", str(tmp_path / "tiny.toml")))
-    words = [str(path), "--seeds", "2", "--epochs", "1", "--engine", "here", "--runs", str(runs)]
-    (drawn,) = answer("study", "run", *words, "qubits=2", "layers=1")["pictures"]
-    assert drawn["problem"] is None, drawn
+    with pytest.raises(QrlSuiteError, match="study 'there' has no seeds yet: qrlsuite study run"):
+        say("plot", "picture", "--study", str(path))
+    say("study", "run", str(path), "--seeds", "2", "--epochs", "1", "--engine", "here", "--runs", str(runs))
+    words = ["plot", "picture", "--study", str(path), "--runs", str(runs)]
+    picture = Path(answer(*words)["picture"])
     kept = sorted(runs.rglob("evaluations/*.jsonl"))
     assert len(kept) == 2, "one for each value; the network has no circuit"
-    before, figure = [path.read_bytes() for path in kept], Path(drawn["file"]).read_bytes()
-    settings = ["qubits=2", "layers=1"]
-    (again,) = answer("study", "draw", str(path), "--runs", str(runs), *settings)["pictures"]
+    before, figure = [path.read_bytes() for path in kept], picture.read_bytes()
+    assert Path(answer(*words)["picture"]).read_bytes() == figure
     assert [path.read_bytes() for path in kept] == before
-    assert Path(again["file"]).read_bytes() == figure
 
 
 def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp_path: Path) -> None:
@@ -226,10 +228,6 @@ def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp
     assert [high / low for low, high in ranges[1:]] == pytest.approx([speed.WITHIN["reference"] ** 2] * 2)
     shown = say("show", widths, "--runs", runs).stdout
     assert re.search(r"left: .* to .* with \d+ workers? \(.* to .* core-hours\)", shown)
-    assert re.search(
-        r"would train 4 of 4 missing \(.* to .* of core time",
-        say("study", "run", widths, "--dry-run", "--runs", runs).stdout,
-    )
     Here.trained.clear()
     say("study", "run", widths, "--engine", "here", "--runs", runs)
     assert sorted(label for label, _ in Here.trained) == [
@@ -246,134 +244,53 @@ def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
     for words in (
         ("show", widths),
         ("study", "run", widths, "--dry-run"),
-        ("study", "run", widths, "--dry-run", "--budget", "1h"),
     ):
         result = say(*words, "--runs", str(runs))
         assert result.exit_code == 0
         assert "vqc-native" in result.stdout
     assert not runs.exists()
-    said = say("study", "run", widths, "--dry-run", "--engine", "here", "--runs", str(runs)).stdout
-    assert "ddqn mlp width=4: 0 of 4 seeds there, would train 4 of 4 missing (" in said
-    steps = answer("study", "run", widths, "--dry-run", "--engine", "here", "--runs", str(runs))["steps"]
-    assert [step["would_train"] for step in steps] == [4, 4, 4]
+    planned = answer("study", "run", widths, "--dry-run", "--runs", str(runs))
+    assert planned["entries"] == answer("show", widths, "--runs", str(runs))["entries"]
     assert not runs.exists()
 
 
-def test_drawing_says_how_many_seeds_each_point_rests_on(widths: str, tmp_path: Path) -> None:
-    runs = str(tmp_path / "runs")
-    words = ("--engine", "here", "--runs", runs)
-    for seeds, width in ((3, 16), (2, 4)):
-        said = say("study", "run", widths, "--seeds", str(seeds), f"mlp width={width}", *words)
-        assert f"{seeds} seeds: ddqn mlp width={width}" in said.stdout
-    drawn = say("study", "draw", widths, "--runs", runs, "--format", "svg")
-    assert "3 seeds: ddqn mlp width=16" in drawn.stdout
-    assert "2 seeds: ddqn mlp width=4" in drawn.stdout
-    assert "nothing yet: ddqn vqc-native qubits=2 layers=1" in drawn.stdout
-    assert (tmp_path / "runs" / "study-widths-scaling.svg").read_text().startswith("<?xml")
-
-
 def test_only_keeps_words_of_labels_but_no_part_of_a_hash(widths: str) -> None:
-    steps = answer("study", "run", widths, "--dry-run")["steps"]
+    steps = answer("study", "run", widths, "--dry-run")["entries"]
     first = steps[0]["entry"]
     part = next(
         first[-8:][i : i + 3] for i in range(6) if first[-8:][i : i + 3] not in str(steps[0]["label"])
     )
-    assert [step["entry"] for step in answer("study", "run", widths, "--dry-run", first)["steps"]] == [first]
-    assert len(answer("study", "run", widths, "--dry-run", "mlp")["steps"]) == 2
+    assert [step["entry"] for step in answer("study", "run", widths, "--dry-run", first)["entries"]] == [
+        first
+    ]
+    assert len(answer("study", "run", widths, "--dry-run", "mlp")["entries"]) == 2
     with pytest.raises(OptionError, match="has no such entry"):
         say("study", "run", widths, "--dry-run", part)
 
 
-def test_a_picture_that_cannot_be_drawn_yet_says_why(widths: str, tmp_path: Path) -> None:
-    text = Path(widths).read_text().replace('kind = "scaling"', 'kind = "bars"')
-    Path(widths).write_text(text.replace('settings = { by = "width" }', "settings = { horizon = 20000000 }"))
-    words = (widths, "--seeds", "2", "mlp", "--epochs", "1")
-    said = say("study", "run", *words, "--engine", "here", "--runs", str(tmp_path / "runs"))
-    assert said.exit_code == 0
-    assert "no picture 'scaling': horizon = 20000000: 'ddqn mlp width=" in said.stdout
-
-
-def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp_path: Path) -> None:
-    words = ("--seeds", "2", "--engine", "here", "--runs", str(tmp_path / "runs"))
-    say("study", "run", widths, "mlp width=16", "--epochs", "2", *words)
-    said = say("study", "run", widths, "mlp", "vqc", "--epochs", "1", "--dry-run", *words)
-    assert "width=4" in said.stdout
-    said = say("study", "run", widths, "mlp width=4", "--epochs", "1", *words)
-    assert "2 seeds: ddqn mlp width=4" in said.stdout
-    drawn = say("study", "draw", widths, "--runs", str(tmp_path / "runs"))
-    assert "2 seeds: ddqn mlp width=16" in drawn.stdout
-    assert "left out, at epoch 1: ddqn mlp width=4" in drawn.stdout
-
-
-def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[PendingEntry]:
-    study = parse(Path(widths).read_text(), "widths.toml")
-    return find_pending(study.members(), tmp_path / "runs", Where(Here(), 2), speeds, range(4), 10)
-
-
-def speeds(mlp: float | None, vqc: float | None) -> Speeds:
-    rows = [Speed(("beam6g", "ddqn", name), {}, s) for name, s in (("mlp", mlp), ("vqc-native", vqc)) if s]
-    return Speeds(references=rows)
-
-
-def test_the_cheapest_entry_is_first_and_the_unknown_last(widths: str, tmp_path: Path) -> None:
-    order = cheapest_first(items(widths, tmp_path, speeds(2.0, 1.0)))
-    assert [item.missing.entry.model.name for item in order] == ["vqc-native", "mlp", "mlp"]
-    assert [item.seconds for item in order] == [40.0, 80.0, 80.0]
-    order = cheapest_first(items(widths, tmp_path, speeds(2.0, None)))
-    assert [item.missing.entry.model.name for item in order] == ["mlp", "mlp", "vqc-native"]
-
-
-def test_what_fits_into_a_budget(widths: str, tmp_path: Path) -> None:
-    """One seed of 10 epochs takes 10 s; two workers; four seeds are missing."""
-    item = items(widths, tmp_path, speeds(1.0, None))[0]
-    assert item.estimate.basis == "reference"
-    assert fitting(item, 9.9, 2) == []
-    assert fitting(item, 10, 2) == [0, 1], "half of it would hold nothing"
-    assert fitting(item, 28, 2) == [0, 1], "half of it is planned for"
-    assert fitting(item, 40, 2) == [0, 1, 2, 3]
-    measured = PendingEntry(item.missing, item.groups, speed.Estimate(1.0, "measured"))
-    assert fitting(measured, 10, 2) == [0, 1]
-    assert fitting(measured, 15, 2) == [0, 1, 2], (
-        "as many core-seconds as two workers have, if no seed is too long"
-    )
-    assert fitting(measured, 20, 2) == [0, 1, 2, 3]
-    unknown = PendingEntry(item.missing, item.groups, speed.Estimate(None, "unknown"))
-    assert fitting(unknown, 1, 2) == [0, 1], "one seed per worker, to learn what it costs"
-
-
-def test_a_budget_that_cannot_hold_one_group(widths: str, tmp_path: Path) -> None:
-    found = items(widths, tmp_path, speeds(1.0, 50.0))
-    check_budget(found, 10, 2)
-    with pytest.raises(
-        OptionError,
-        match=r"cannot hold one group: a seed of 'ddqn mlp width=16' .* takes about 10 s \(3 s to 30 s; ",
-    ):
-        check_budget(found, 9, 2)
-
-
-def test_a_budget_is_kept_and_the_same_command_continues(widths: str, tmp_path: Path) -> None:
+def test_the_entry_that_lacks_least_is_first_and_a_budget_is_one_for_all(widths: str, tmp_path: Path) -> None:
     words = (widths, "--engine", "here", "--runs", str(tmp_path / "runs"))
-    with pytest.raises(OptionError):
-        say("study", "run", *words, "--budget", "0.001s")
-    assert not (tmp_path / "runs").exists()
-    assert answer("study", "run", *words, "--budget", "1h")["core_hours_left"] == 0
-    assert len(Here.trained) >= 3
-
-
-def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -> None:
-    ticks = iter(range(0, 10_000, 60))
-    known = speeds(0.1, 0.2)
-    session = Session(
-        tmp_path / "runs", Where(Here(), 1), known, budget=100, quiet=True, clock=lambda: float(next(ticks))
-    )
-    left = session.run(items(widths, tmp_path, known))
-    assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))], (
-        "the second look at the clock is past the budget"
-    )
-    assert [(item.missing.entry.label, len(item.missing.todo)) for item in left] == [
-        ("ddqn mlp width=4", 4),
-        ("ddqn vqc-native qubits=2 layers=1", 4),
+    for more in (("mlp width=4", "--seeds", "2"), ("--budget", "0.000001s"), ("--budget", "1h")):
+        say("study", "run", *words, *more)
+    assert Here.trained == [
+        ("ddqn mlp width=4", (0, 1)),
+        ("ddqn mlp width=4", (2, 3)),
+        ("ddqn mlp width=16", (0, 1, 2, 3)),
+        ("ddqn vqc-native qubits=2 layers=1", (0, 1, 2, 3)),
     ]
+
+
+def test_a_picture_of_a_study_shows_its_group_without_short_entries(widths: str, tmp_path: Path) -> None:
+    words = ("--seeds", "2", "--engine", "here", "--runs", str(tmp_path / "runs"))
+    say("study", "run", widths, "mlp width=16", "vqc", "--epochs", "2", *words)
+    say("study", "run", widths, "mlp width=4", "--epochs", "1", *words)
+    drawn = say("plot", "scaling", "--study", widths, "--runs", str(tmp_path / "runs"))
+    assert "left out: ddqn mlp width=4: ends at " in drawn.stderr
+    assert f"wrote {tmp_path}/runs/study-widths-scaling.png" in drawn.stdout
+    seeds = answer("plot", "scaling", "--study", widths, "--runs", str(tmp_path / "runs"))["seeds"]
+    assert [name.partition("-")[2][:3] for name in seeds] == ["mlp"]
+    with pytest.raises(OptionError, match="has no complete run of seed 2"):
+        say("plot", "scaling", "--study", widths, "--seeds", "3", "--runs", str(tmp_path / "runs"))
 
 
 def test_an_engine_that_hands_over_is_given_everything_once(widths: str, tmp_path: Path) -> None:
@@ -381,21 +298,20 @@ def test_an_engine_that_hands_over_is_given_everything_once(widths: str, tmp_pat
     said = say("study", "run", *words)
     assert said.stdout.count("4 seeds submitted") == 3
     again = answer("study", "run", *words)
-    assert again["submitted"] == []
+    assert "submitted" not in again
     assert [entry["busy"] for entry in again["entries"]] == [4, 4, 4]
 
 
-def test_ctrl_c_saves_and_draws_and_the_same_command_resumes(widths: str, tmp_path: Path, hold: Hold) -> None:
+def test_ctrl_c_saves_and_the_same_command_resumes(widths: str, tmp_path: Path, hold: Hold) -> None:
     runs = tmp_path / "runs"
     words = ["study", "run", widths, "mlp width=16"]
     words += ["--epochs", "8", "--seeds", "2", "--workers", "1", "--runs"]
     process = start(*words, str(runs), env=hold.environment)
     hold.wait(process)
     os.kill(process.pid, signal.SIGINT)
-    out, message = process.communicate(timeout=HANGS)
+    _, message = process.communicate(timeout=HANGS)
     assert process.returncode == 130, message
     assert "every finished epoch is saved. The same command continues" in message
-    assert "study-widths-curves.png" in out
     assert not list(runs.glob("tiny/*/seed-*/epochs.parquet"))
     for folder in (runs, tmp_path / "straight"):
         assert qrlsuite(*words, str(folder)).returncode == 0
@@ -422,23 +338,20 @@ def test_all_studies_at_once_the_one_that_lacks_least_first(tmp_path: Path) -> N
     words = ("--engine", "here", "--seeds", "2", "--epochs", "1", "--runs", str(tmp_path / "runs"))
     said = say("study", "run", "all", *words)
     assert said.stderr.index("study without-circuit:") < said.stderr.index("study widths:")
-    assert said.stdout.index("study-without-circuit-curves.png") < said.stdout.index(
-        "study-widths-curves.png"
-    )
+    assert said.stdout.index("--study without-circuit") < said.stdout.index("--study widths")
     assert [label for label, _ in Here.trained].count("ddqn mlp width=16") == 1, (
         "an entry of both is trained once"
     )
-    assert answer("study", "run", "all", "--dry-run", *words)["steps"] == []
-    found = json.loads(say("study", "run", "all", "--json", *words[:-1], str(tmp_path / "more")).stdout)
-    assert [(each["name"], each["trained"]) for each in found] == [("without-circuit", 2), ("widths", 4)]
+    found = json.loads(say("study", "run", "all", "--dry-run", "--json", *words).stdout)
+    assert not any(entry["missing"] for each in found for entry in each["entries"])
+    assert {each["name"] for each in found} == {"without-circuit", "widths"}
 
 
 @pytest.mark.usefixtures("two_studies")
 def test_all_skips_studies_without_the_wanted_entries(tmp_path: Path) -> None:
     words = ("vqc", "--runs", str(tmp_path / "runs"))
-    assert {step["label"] for step in answer("study", "run", "all", "--dry-run", *words)["steps"]} == {
-        "ddqn vqc-native qubits=2 layers=1"
-    }
+    [found] = json.loads(say("study", "run", "all", "--dry-run", "--json", *words).stdout)
+    assert [entry["label"] for entry in found["entries"]] == ["ddqn vqc-native qubits=2 layers=1"]
     said = say("study", "run", "all", "--dry-run", *words).stderr
     assert said == "left out: vqc: study 'without-circuit' has no such entry\n"
     with pytest.raises(OptionError, match="has no such entry"):
@@ -447,22 +360,6 @@ def test_all_skips_studies_without_the_wanted_entries(tmp_path: Path) -> None:
     broken.write_text(broken.read_text().replace('kind = "scaling"', 'kind = "scalin"'))
     with pytest.raises(QrlSuiteError, match="scalin"):  # it is no study without such an entry
         say("study", "run", "all", "--dry-run", *words)
-
-
-@pytest.mark.usefixtures("two_studies")
-def test_the_budget_of_all_studies_is_one(tmp_path: Path) -> None:
-    ticks = iter(range(0, 10_000, 60))
-    where, known = Where(Here(), 1), speeds(0.1, 0.2)
-    session = Session(
-        tmp_path / "runs", where, known, budget=100, quiet=True, clock=lambda: float(next(ticks))
-    )
-    for path in ("without-circuit.toml", "widths.toml"):
-        left = session.run(items(str(tmp_path / path), tmp_path, known))
-    assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))]
-    assert [item.missing.entry.label for item in left] == [
-        "ddqn mlp width=4",
-        "ddqn vqc-native qubits=2 layers=1",
-    ]
 
 
 @pytest.mark.usefixtures("two_studies")
@@ -488,7 +385,7 @@ def test_published_seeds_are_counted_beside_one_s_own(tmp_path: Path) -> None:
     assert row.split()[:7] == ["beam6g", "ppo", "mlp", "width=16", "0/100", "20", "500"]
     assert "published" not in answer(*words)["entries"][0]
     members = find("ppo").members()
-    longer = find_pending(members, tmp_path, Where.create(), Speeds(), None, 501)
+    longer = find_missing(members, tmp_path, Where.create(), None, 501)
     assert not any(studies.published_seeds(longer).values()), "none of them reached epoch 501"
 
 

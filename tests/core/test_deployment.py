@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,8 @@ import pytest
 from qrlsuite import api
 from qrlsuite.api.evaluation import evaluate
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
-from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import EntryStore
-from qrlsuite.studies import study
 from qrlsuite.training import deployment, evaluation
 from qrlsuite.training.deployment import Deployment, on_backend
 from tests.commands import answer, say
@@ -160,14 +159,15 @@ deployed = { backend = "pennylane", vary = "shots", values = [5], options = { de
 
 
 def test_a_study_executes_nothing_on_hardware(
-    trained: EntryStore, tiny_task: str, unreliable: type[Unreliable]
+    trained: EntryStore, tiny_task: str, unreliable: type[Unreliable], tmp_path: Path
 ) -> None:
     unreliable.batches = 0
-    parsed = study.parse(STUDY.replace("TASK", tiny_task), "hardware.toml")
-    (drawn,) = studies.draw(parsed, parsed.members(), Selection(trained.path.parent.parent))
-    assert (
-        "device=unreliable.qpu shots=5 is no simulator: a study executes nothing on hardware" in drawn.problem
-    )
+    path = tmp_path / "hardware.toml"
+    path.write_text(STUDY.replace("TASK", tiny_task))
+    with pytest.raises(
+        OptionError, match=r"unreliable\.qpu shots=5 is no simulator: a picture executes nothing"
+    ):
+        api.plot("picture", study=str(path), runs=trained.path.parent.parent)
     assert unreliable.batches == 0
 
 

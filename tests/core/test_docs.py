@@ -183,10 +183,8 @@ def test_published_entries_in_examples_exist(place: str, line: str) -> None:
         if name.isupper():
             continue  # compare FIRST SECOND
         assert collect.find(collect.Selection.create("none", tasks, published=True), name)
-    named_studies = [
-        values.get("name" if line.split()[1] == "study" else "study"),
-        *(values.get("names") or ()),
-    ]
+    of_study = values.get("name" if line.split()[1] == "study" else "study") or ()
+    named_studies = [*([of_study] if isinstance(of_study, str) else of_study), *(values.get("names") or ())]
     for study in [name for name in named_studies if name and not name.isupper()]:
         assert studies.select(study, collect.Selection.create("none", tasks, published=True))[0]
 

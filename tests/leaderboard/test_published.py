@@ -25,7 +25,6 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards import board, costs
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect, import_seeds, plausible, published, verify
@@ -33,8 +32,7 @@ from qrlsuite.leaderboard.shelf.curves import edited_between
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore, table_bytes
-from qrlsuite.studies.study import parse
-from tests.commands import say
+from tests.commands import answer, say
 from tests.conftest import TINY, Train, trainer
 from tests.leaderboard import boards
 from tests.leaderboard.boards import refused
@@ -725,19 +723,9 @@ def test_an_ambiguous_name_lists_entries_of_boards_where_some_fit(tmp_path: Path
 
 
 def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:
-    runs = tmp_path / "runs"
-    assert "nothing is trained yet" in refused("study", "draw", two, "--runs", runs)
-    done = say("study", "draw", two, "--published", "--runs", str(runs))
-    assert "100 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
-    assert (runs / "study-two-picture.png").exists()
-    done = say("study", "draw", two, "--published", "--seeds", "20", "--runs", str(runs))
-    assert "20 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
-    said = refused("study", "draw", two, "--published", "--seeds", 101, "--runs", runs)
-    assert "has no complete run of seed 100" in said
-
-
-def test_published_entries_play_no_episodes(two: str, tmp_path: Path) -> None:
-    text = Path(two).read_text().replace('kind = "bars"', 'kind = "histogram"\nevaluation = { best = 1 }')
-    study = parse(text, "two.toml")
-    (drawn,) = studies.draw(study, study.members(), collect.Selection(tmp_path, published=True))
-    assert drawn.problem == "nothing is trained yet", "agents are not published"
+    words = ("plot", "picture", "--study", two, "--runs", str(tmp_path / "runs"))
+    assert "study 'two' has no seeds yet" in refused(*words)
+    assert set(answer(*words, "--published")["seeds"].values()) == {100}
+    assert (tmp_path / "runs" / "study-two-picture.png").exists()
+    assert set(answer(*words, "--published", "--seeds", "20")["seeds"].values()) == {20}
+    assert "has no complete run of seed 100" in refused(*words, "--published", "--seeds", 101)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from qrlsuite.api.entries import draw_picture
 from qrlsuite.cli.arguments import (
     EntryOption,
     HorizonOption,
@@ -19,7 +20,7 @@ from qrlsuite.cli.arguments import (
 )
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.pictures.compose import compose, summaries
+from qrlsuite.leaderboard.pictures.compose import summaries
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import write_atomically
 
@@ -50,6 +51,14 @@ def plot(
         ),
     ] = None,
     entry: EntryOption = None,
+    study: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--study",
+            help="A picture that this study names, or of its entries; with looks `pairs` and `entries`, too. Repeat it "
+            "for the pairs that several studies with looks compare, each on another task.",
+        ),
+    ] = None,
     horizon: HorizonOption = None,
     seeds: Annotated[
         str | None,
@@ -76,14 +85,16 @@ def plot(
     unless --entry asks for it.
 
     Examples: qrlsuite plot bars --task beam6g --out bars.pdf; qrlsuite plot surface style=3d;
-    qrlsuite plot trajectories environment.degree=5 --task beam6g
+    qrlsuite plot trajectories environment.degree=5 --task beam6g; qrlsuite plot scaling --study fig7 --published;
+    qrlsuite plot pairs --study quantum-or-not
     """
     format_ = pictures.format_of(output)
     picture_settings, environment_settings = _split(settings or [])
-    drawn = compose(
+    drawn = draw_picture(
         kind,
         Selection.create(runs, task, published),
         entry or [],
+        study or [],
         horizon=horizon,
         seeds=seeds,
         settings=picture_settings,
@@ -91,8 +102,9 @@ def plot(
     )
     for line in drawn.left_out:
         typer.echo(f"left out: {line}", err=True)
-    name = f"{'-'.join(drawn.tasks)}-{kind}.png".removeprefix("-")
-    path = output or (runs / name if drawn.entries else Path(name))
+    shown = [f"study-{Path(study[0]).stem}"] if study else drawn.tasks
+    name = f"{'-'.join(shown)}-{kind}.png".removeprefix("-")
+    path = output or (runs / name if drawn.entries or study else Path(name))
     write_atomically(path, pictures.encode(drawn.figure, format_))
     if json_output:
         counts = {e.name: len(e.seeds) for e in drawn.entries}

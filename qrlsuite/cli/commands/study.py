@@ -1,4 +1,4 @@
-"""`qrlsuite study`: run experiments by name, with or without looks, and draw their pictures."""
+"""`qrlsuite study`: run experiments by name, with or without looks."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from qrlsuite import api, registry, specs
 from qrlsuite.api.arguments import where_of
 from qrlsuite.api.studies import (
     ALL,
-    draw_study,
     end_study,
-    find_work,
+    plan,
     require_unchanged,
     take_looks,
+    train_studies,
 )
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, TrainedTaskOption, split_settings
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TrainedTaskOption, split_settings
 from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
@@ -31,7 +31,7 @@ from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
 from qrlsuite.notation import parse_named
-from qrlsuite.results.text import counted, duration_range
+from qrlsuite.results.text import counted
 from qrlsuite.studies.outcome import StudyOutcome
 
 app = typer.Typer(
@@ -56,10 +56,6 @@ WordsArgument = Annotated[
         help="Only entries with one of these words in group, label or task, or with this name. qubits=6 sets an option "
         "wherever an entry has it; vqc-native=vqc-pennylane puts a model in the place of another.",
     ),
-]
-OutOption = Annotated[
-    str,
-    typer.Option("--format", metavar="FORMAT", help="Of the pictures, in the results folder: png, pdf, svg."),
 ]
 
 
@@ -139,11 +135,10 @@ def run(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Train a study's missing seeds, cheapest entry first, and draw its pictures (`study draw` has other formats).
+    """Train a study's missing seeds, the entry that lacks least first.
 
     Entries are those that `qrlsuite run` trains, in the same folders: nothing is trained twice. Stop with Ctrl-C at
-    any time, or give a --budget; the same command continues. `all` begins with the study that lacks least, so that
-    the next answer comes as soon as it can.
+    any time, or give a --budget; the same command continues. `all` begins with the study that lacks least.
 
     A study with looks is trained look by look, until every pair is decided or the last look was taken. An entry stops
     when all its pairs are closed.
@@ -158,64 +153,19 @@ def run(
         outcome = take_looks(study, where, budget, runs, not json_output)
         _report(name, outcome, budget, runs, json_output)
         return
-    work = find_work(name, *_changes(words), seeds, epochs, budget, where, runs)
-    for line in work.left_out:
+    planned, left_out = plan(name, *_changes(words), seeds, epochs, where, runs)
+    for line in left_out:
         typer.echo(f"left out: {line}", err=True)
-    if dry_run:
-        _dry_run(name, work.steps(), json_output)
-        return
-    results = []
-    for done in work.train("png", progress=not json_output):
-        results.append(done.as_dict())
-        if not json_output:
-            for line in (*(line for picture in done.pictures for line in picture.lines()), *done.submitted):
-                typer.echo(line)
+    done = []
+    for found in planned if dry_run else train_studies(planned, where, budget, not json_output):
+        done.append(found.as_dict())
+        if dry_run and not json_output:
+            table_console().print(found, soft_wrap=True)
+        elif not json_output:
+            shown = found.study.name if name == ALL else name
+            typer.echo("\n".join([*found.submitted, *studies.next_steps(shown, found, runs)]))
     if json_output:
-        typer.echo(json.dumps(results if name == ALL else results[0]))
-
-
-@app.command()
-def draw(
-    name: StudyArgument,
-    words: WordsArgument = None,
-    seeds: Annotated[
-        str | None,
-        typer.Option(
-            "--seeds",
-            help="Of every entry these alone: 20, 0:20 or 0,3,10:12; default: all that are finished.",
-        ),
-    ] = None,
-    format_: OutOption = "png",
-    published: PublishedOption = False,
-    runs: RunsOption = Path("runs"),
-    json_output: JsonOption = False,
-) -> None:
-    """Draw a study's pictures from finished seeds; trains nothing.
-
-    Sample complexities of few and of many seeds are different quantities: --seeds 20 draws equal numbers. Of a study
-    with looks, every pair is drawn below its question, and every entry by its steps below threshold; of several, each
-    of another task, the pairs that all of them compare, task by task.
-
-    Examples: qrlsuite study draw degree --published --seeds 20 --format pdf; qrlsuite study draw
-    quantum-or-not-degree5 quantum-or-not-a3-0
-    """
-    options, models, only = _changes(words)
-    more = only if studies.find(name).file.looks is not None else []
-    study, drawn = draw_study(
-        name,
-        *more,
-        options=options,
-        models=models,
-        only=[] if more else only,
-        seeds=seeds,
-        format=format_,
-        runs=runs,
-        published=published,
-    )
-    if json_output:
-        typer.echo(json.dumps({"name": study.name, "pictures": [each.as_dict() for each in drawn]}))
-    else:
-        typer.echo("\n".join(line for picture in drawn for line in picture.lines()))
+        typer.echo(json.dumps(done if name == ALL else done[0]))
 
 
 @app.command()
@@ -249,23 +199,4 @@ def _report(name: str, outcome: StudyOutcome, budget: str | None, runs: Path, js
         who = "others train" if budget is None else "the budget is used up, or others train"
         typer.echo(f"{who} {lacking}: repeat this command when they have finished")
     elif outcome.finished:
-        typer.echo(f"next: {command('study', 'draw', name, runs=runs)}")
-
-
-def _dry_run(name: str, steps: list[dict[str, Any]], json_output: bool) -> None:
-    if json_output:
-        typer.echo(json.dumps({"name": name, "steps": steps}))
-        return
-    for step in steps:
-        cost = step["core_seconds_range"]
-        text = (
-            "of unknown cost"
-            if cost is None
-            else f"{duration_range(*cost)} of core time for all, {step['basis']}"
-        )
-        typer.echo(
-            f"{step['task']}  {step['label']}: {step['finished']} of {counted(step['seeds'], 'seed')} there, would "
-            f"train {step['would_train']} of {step['missing']} missing ({text})"
-        )
-    if not steps:
-        typer.echo("nothing is missing")
+        typer.echo(f"next: {command('plot', 'pairs', '--study', name, runs=runs)}")
