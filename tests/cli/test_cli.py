@@ -334,7 +334,6 @@ tune mlp --task tiny.toml --sampler 'random trial=3' => did you mean 'trials'
 study run fig66 => unknown study 'fig66'; did you mean 'fig6'
 study run gone.toml => study file gone.toml cannot be read
 study run fig6 --budget soon => write 90s, 30min, 8h
-study run fig6 --budget 8h --engine slurm => --budget: engine 'slurm' leaves its tasks in a queue
 study run fig6 --engine lokal => did you mean 'local'
 study run fig6 --seeds a:b => write a number (100)
 study run fig6 vqc-native=vqc-nativ => unknown model 'vqc-nativ'; did you mean 'vqc-native'
