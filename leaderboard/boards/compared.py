@@ -33,7 +33,7 @@ class EntryComparison(Shown, Comparison):
     pair:
         The verdict by steps below threshold, and the final scores.
     remarks:
-        Facts that may flatter one of the entries.
+        Notes on the entries, as below a board: those that may turn the verdict first.
     show_cells:
         Whether the cells are shown one by one: a rule was asked for.
     among:
@@ -127,16 +127,10 @@ def compare_entries(
     rule = rule or rule_of([first, second])
     comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
-    remarks = (
-        tables.unlike_others([first, second])
-        + tables.changed_thresholds([first, second])
-        + [
-            f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
-            for entry in (first, second)
-            if entry.on_protocol_seeds
-        ]
-    )
-    return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=tuple(remarks), show_cells=asked)
+    both = [first, second]
+    flattered = [f"{entry.label}: {tables.MARKS['†']}" for entry in both if entry.on_protocol_seeds]
+    remarks = (*tables.doubts(both), *flattered, *tables.remarks(both))
+    return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=remarks, show_cells=asked)
 
 
 SYMBOLS = {

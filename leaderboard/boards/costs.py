@@ -305,7 +305,7 @@ class CostSection:
 
     def notes(self) -> list[str]:
         """Explain the columns, and the marks that occur."""
-        lines = tables.unlike_others([row.entry for row in self.rows])
+        lines = tables.doubts([row.entry for row in self.rows])
         if self.compared is not None:
             lines.append(
                 f"rank: by significant outperformance, within {self.unit.text(self.budget)} {self.unit.name}, which is "

@@ -142,9 +142,10 @@ class ScoreSection:
             "ties one half",
         ]
         return [
-            *tables.unlike_others(self.entries),
+            *tables.doubts(self.entries),
             *lines,
             *([f"fewer than {MIN_RUNS} seeds: {', '.join(self.unranked)}"] if self.unranked else []),
+            *tables.remarks(self.entries),
         ]
 
     def sheet(self, explain: bool = False) -> Sheet:

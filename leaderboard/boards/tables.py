@@ -12,6 +12,7 @@ from qrlsuite.leaderboard.boards import columns
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.notation import START
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import (
     counted,
     interval_text,
@@ -120,9 +121,9 @@ def notes(section: Section, by_tiers: bool, special: Sequence[str] = ()) -> list
     """
     first, *others = tier_notes(section) if by_tiers else _rank_notes(section)
     entries = [row.entry for row in section.rows]
-    warnings = [*unlike_others(entries), *_never(section), *_diverged(section), *changed_thresholds(entries)]
     promise = [f"rule '{section.rule}': {section.promise}"] * by_tiers
-    return [first, *warnings, *others, *_marks(section), *special, *promise, *facts(section)]
+    marks = _marks(section)
+    return [first, *doubts(entries), *_never(section), *others, *marks, *special, *promise, *remarks(entries)]
 
 
 def title(section: Section) -> str:
@@ -179,16 +180,7 @@ def _marks(section: Section) -> list[str]:
     }
     protocol = rows[0].entry.task_file.protocol.seeds
     marks = [f"{mark} {MARKS[mark].format(protocol=protocol)}" for mark, there in occurring.items() if there]
-    return ["; ".join(marks)] * bool(marks) + unequal_tuning(section)
-
-
-def _diverged(section: Section) -> list[str]:
-    found = [row.entry for row in section.rows if row.entry.diverged]
-    told = ", ".join(f"{entry.label} ({_of_seeds(entry)})" for entry in found)
-    line = (
-        f"diverged (numbers of the agents are no longer finite), ranked with the scores that they had: {told}"
-    )
-    return [line] * bool(found)
+    return ["; ".join(marks)] * bool(marks)
 
 
 def _never(section: Section) -> list[str]:
@@ -206,50 +198,59 @@ def _of_seeds(entry: EntryResults) -> str:
     return f"{len(entry.diverged)} of {len(entry.seeds)} seeds"
 
 
-def facts(section: Section) -> list[str]:
-    """Return further notes on a section's entries."""
-    lines = []
-    alone = [row.entry.label for row in section.rows if row.entry.first_network_alone]
-    if alone:
-        lines.append(
-            "parameters of the first network alone (older records count no other, such as a critic): "
-            + ", ".join(alone)
-        )
-    unprobed = [row.entry.label for row in section.rows if row.entry.unprobed]
-    if unprobed:
-        lines.append(
-            f"not probed: {', '.join(unprobed)}; made with code of others, and no seed was trained again alone to show "
-            "that seeds do not depend on each other (`qrlsuite run` does, where it trains)"
-        )
-    missing = sorted({name for row in section.rows for name in absent(row.entry)})
-    if missing:
-        lines.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
-    tuned = [row.entry for row in section.rows if row.entry.tuning]
-    if tuned:
-        lines.append(
-            "settings found by tuning: "
-            + ", ".join(
-                f"{entry.label} ({_tuning_text(entry.tuning or {}, entry.preset)})" for entry in tuned
-            )
-        )
-    mixed = [row.entry for row in section.rows if row.entry.mixed_versions]
-    if mixed:
-        lines.append(
-            "made with several versions, see `qrlsuite show ENTRY`: "
-            + ", ".join(f"{entry.label} ({', '.join(entry.mixed_versions)})" for entry in mixed)
-        )
-    merged = [row.entry.label for row in section.rows if len(row.entry.codes) > 1]
-    if merged:
-        lines.append(
-            "seeds of several codes that `--same` joined, see `qrlsuite show ENTRY`: " + ", ".join(merged)
-        )
-    devices = [row.entry for row in section.rows if len(row.entry.devices) > 1]
-    if devices:
-        lines.append(
-            "trained on several kinds of device, see `qrlsuite show ENTRY`: "
-            + ", ".join(f"{entry.label} ({', '.join(entry.devices)})" for entry in devices)
-        )
-    return lines
+def remarks(entries: Sequence[EntryResults]) -> list[str]:
+    """Return further notes on entries, below every table and verdict: how they were tuned, and what made them."""
+    tuned = {entry.label: _tuning_text(entry.tuning, entry.preset) for entry in entries if entry.tuning}
+    notes = {
+        "parameters of the first network alone (older records count no other, such as a critic)": {
+            entry.label: "" for entry in entries if entry.first_network_alone
+        },
+        "made with code of others, and not probed": {entry.label: "" for entry in entries if entry.unprobed},
+        "not installed here, so judged from the stored curves": {
+            name: "" for entry in entries for name in absent(entry)
+        },
+        "settings found by tuning": tuned,
+        "made with several versions, see `qrlsuite show ENTRY`": {
+            entry.label: ", ".join(entry.mixed_versions) for entry in entries if entry.mixed_versions
+        },
+        "seeds of several codes that `--same` joined, see `qrlsuite show ENTRY`": {
+            entry.label: "" for entry in entries if len(entry.codes) > 1
+        },
+        "trained on several kinds of device, see `qrlsuite show ENTRY`": {
+            entry.label: ", ".join(entry.devices) for entry in entries if len(entry.devices) > 1
+        },
+    }
+    return [*_unequal_tuning(entries), *_listed(notes)]
+
+
+def doubts(entries: Sequence[EntryResults]) -> list[str]:
+    """Return the notes on entries that may turn a verdict: these stand first."""
+    notes = {
+        "curves that other programs made, and nobody here can train or check again": {
+            entry.label: "" for entry in entries if entry.external
+        },
+        "warm-started, without the steps that their first agents took before": {
+            entry.label.partition(f" {START}=")[0]: f"from {entry.identity[START]}"
+            for entry in entries
+            if START in entry.identity
+        },
+        "diverged (numbers of the agents are no longer finite), judged with the scores that they had": {
+            entry.label: _of_seeds(entry) for entry in entries if entry.diverged
+        },
+        "unfinished seeds, left out": {
+            entry.label: format_seeds(entry.left_out) for entry in entries if entry.left_out
+        },
+    }
+    return [*_listed(notes), *_edited(entries), *changed_thresholds(entries)]
+
+
+def _listed(notes: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Write a line for each note: the labels that it is on, and what is said of each."""
+    return [
+        f"{note}: {', '.join(f'{label} ({text})' if text else label for label, text in labels.items())}"
+        for note, labels in notes.items()
+        if labels
+    ]
 
 
 def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
@@ -263,22 +264,6 @@ def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
     levels = ", ".join(f"{level:g}" for level in used)
     told = f"thresholds changed after the first seed: {', '.join(labels)} (judged by {levels})"
     return [told] if labels else []
-
-
-def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
-    """Name the entries with curves of another program, with trained agents at the start, or with edited plugins."""
-    lines = {
-        "curves that other programs made, and nobody here can train or check again": [
-            entry.label for entry in entries if entry.external
-        ],
-        "warm-started, without the steps that their first agents took before": [
-            f"{entry.label.partition(f' {START}=')[0]} (from {entry.identity[START]})"
-            for entry in entries
-            if START in entry.identity
-        ],
-    }
-    told = [f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels]
-    return [*told, *_edited(entries)]
 
 
 def _grouped(labels: Mapping[str, Hashable]) -> str:
@@ -299,15 +284,13 @@ def _edited(entries: Sequence[EntryResults]) -> list[str]:
     return lines
 
 
-def unequal_tuning(section: Section) -> list[str]:
-    """Return notes on entries that are ranked against each other, but were tuned unequally."""
-    tuned = [row.entry.tuning for row in section.rows if row.entry.tuning]
-    lines = []
-    if 0 < len(tuned) < len(section.rows):
-        lines.append(
-            "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
-        )
+def _unequal_tuning(entries: Sequence[EntryResults]) -> list[str]:
+    """Return notes on entries that are judged against each other, but were tuned unequally."""
+    tuned = [entry.tuning for entry in entries if entry.tuning]
     budgets = {record.get("budget") for record in tuned}
+    lines = []
+    if 0 < len(tuned) < len(entries):
+        lines.append("tuned and untuned settings are compared: a difference may be one of tuning")
     if len(budgets) > 1:
         texts = sorted("not known" if budget is None else str(budget) for budget in budgets)
         lines.append(f"tuned with different budgets: {'; '.join(texts)}")

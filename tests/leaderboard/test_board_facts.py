@@ -8,6 +8,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.boards import board, steps
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.boards.ranked import ranking_of
+from qrlsuite.leaderboard.boards.scores import rank_by_score
 from qrlsuite.leaderboard.pictures import tiers
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -174,13 +176,35 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
     assert (old.parameters, old.networks) == ((387, 0), None)
 
 
-def test_devices_that_mix_within_an_entry_are_named() -> None:
+CPU, CUDA = (Provenance(device=DeviceRecord(kind=kind), versions={"torch": kind}) for kind in ("cpu", "cuda"))
+NOTES: dict[str, dict[str, Any]] = {
+    "trained on several kinds of device, see `qrlsuite show ENTRY`: {} (cpu, cuda)": {"provenance": [CPU, CUDA]},
+    "made with several versions, see `qrlsuite show ENTRY`: {} (torch)": {"provenance": [CPU, CUDA]},
+    "diverged (numbers of the agents are no longer finite), judged with the scores that they had: {} (20 of 20 seeds)":
+    {"diverged": 3},
+    "settings found by tuning: {} (3 trials)": {"tuning": {"trials": 3}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("note", NOTES)
+def test_every_verdict_names_what_may_lie_behind_it(note: str) -> None:
     one, two = boards.graded(2)
-    cpu, cuda = (Provenance(device=DeviceRecord(kind=kind)) for kind in ("cpu", "cuda"))
-    made = boards.of([boards.changed(one, provenance=[cpu, cuda]), boards.changed(two, provenance=[cpu])])
-    note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
-    assert note in markdown(made).split("  \n")
-    assert "several kinds of device" not in markdown(boards.of([one, two]))
+    changed, plain = (boards.changed(each, provenance=[CPU]) for each in (one, two))
+    changed, text = boards.changed(changed, **NOTES[note]), note.format(one.label)
+    assert text in markdown(boards.of([changed, plain])).split("  \n")
+    assert text in compare_entries(changed, plain).remarks
+    assert text in rank_by_score([changed, plain], 200_000, "score").notes()
+    others = compare_entries(boards.changed(one, provenance=[CPU]), plain).remarks
+    assert not any(remark.partition(":")[0] == text.partition(":")[0] for remark in others)
+
+
+def test_unfinished_seeds_are_named() -> None:
+    one, two = boards.graded(2)
+    short = {seed: replace(one.records[seed], scores=one.records[seed].scores[:40]) for seed in (6, 7, 9)}
+    begun = replace(one, records={**one.records, **short})
+    said = f"unfinished seeds, left out: {one.label} (6:8,9)"
+    assert said in compare_entries(begun, two).remarks
+    assert said in markdown(boards.of([begun, two])).split("  \n")
 
 
 def test_the_board_says_where_settings_come_from() -> None:
@@ -197,7 +221,7 @@ def test_the_board_says_where_settings_come_from() -> None:
     )
     assert boards.changed(one, preset="mine.toml").settings == "mine.toml"
     assert boards.changed(one, tuning={"trials": None, "seeds": "1000000:?"}).settings == "tuned"
-    mixed = "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
+    mixed = "tuned and untuned settings are compared: a difference may be one of tuning"
     text = markdown(boards.of([tuned, released, by_hand]))
     assert mixed in text.split("  \n")
     assert "| tuned (16 trials, 32 seeds) |" in text

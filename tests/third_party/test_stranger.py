@@ -246,7 +246,8 @@ def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Install
     assert board() == before
     table = " ".join(installed.qrlsuite("leaderboard", "--explain", "--runs", "ranked").stdout.split())
     assert (
-        "not installed here: environment 'channel-hop', model 'waves'; ranked from the stored curves" in table
+        "not installed here, so judged from the stored curves: environment 'channel-hop', model 'waves'"
+        in table
     )
     circuits = installed.qrlsuite(
         "leaderboard", "--runs", "circuits", "--format", "markdown", "--explain"
