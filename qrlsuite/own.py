@@ -1,9 +1,9 @@
 """Plugins by path: a Python file or a package's folder that is used as it lies there, without being installed.
 
-The content of a file or folder is read once, when it is loaded. This content runs, is covered by an entry's code
-identity, and is copied into the entry's folder, even if the file changes meanwhile. Its top-level module is imported
-under its own name. In the registry the name of the file or folder stands where an installed plugin has the name of its
-distribution.
+A plugin is read, and copied to a folder that is named by its content. This copy runs, in every process; an entry's code
+identity covers it, and the entry's folder gets it, even if the file changes meanwhile. A file brings with it the
+modules beside it that it imports, and the data that it declares at its top level: `files = ["weights.npy"]`. In the
+registry the name of the file or folder stands where an installed plugin has the name of its distribution.
 
 A plugin registers by hooks, as an installed one does, or by `qrlsuite.register`. Where it has neither, whatever can be
 recognized in its top-level module is registered: see `qrlsuite.shortforms`.
@@ -11,21 +11,24 @@ recognized in its top-level module is registered: see `qrlsuite.shortforms`.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import hashlib
 import importlib
-import importlib.abc
 import importlib.util
 import inspect
 import keyword
 import linecache
 import os
+import shutil
 import sys
+import tempfile
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib.machinery import ModuleSpec, SourceFileLoader
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -66,6 +69,11 @@ class Source:
         return self.path.name.removesuffix(".py")
 
     @property
+    def modules(self) -> set[str]:
+        """The names of its top-level modules: its own, and of a file the modules beside it that it imports."""
+        return {name.partition("/")[0].removesuffix(".py") for name in self.files if name.endswith(".py")}
+
+    @cached_property
     def mark(self) -> str:
         """Sixteen hexadecimal digits that tell this content from other content."""
         content = hashlib.sha256()
@@ -73,25 +81,23 @@ class Source:
             content.update(f"{name}\0{len(self.files[name])}\0".encode() + self.files[name])
         return content.hexdigest()[:16]
 
+    @cached_property
+    def copy(self) -> Path:
+        """The file or folder in this user's cache that runs."""
+        return copy(self, _cache())
+
     def place(self, relative: str) -> str:
-        """Return the whole path of one of the files."""
+        """Return the whole path of one of the files, where it was read."""
         return str(self.path.parent / relative)
 
 
 @dataclass
 class Loaded:
-    """A loaded plugin and its registered things.
-
-    Attributes
-    ----------
-    cell:
-        Whether it was made of code in a notebook or script, which may register the same name again.
-    """
+    """A loaded plugin and its registered things."""
 
     source: Source
     plugin: Plugin
     registered: list[Registered[Any]]
-    cell: bool = False
 
     @property
     def sentence(self) -> str:
@@ -100,50 +106,77 @@ class Loaded:
         return f"{self.source.name}: {listed(things) or 'commands alone'}"
 
 
-@dataclass
-class _Own:
-    """The plugins by path of a registry.
-
-    Attributes
-    ----------
-    handed:
-        Arguments of `register` while a plugin is imported, with file and line; None at other times.
-    """
-
-    loaded: dict[str, Loaded] = field(default_factory=dict)
-    handed: list[tuple[Any, str]] | None = None
-
-
-def _own() -> _Own:
-    known = registry.load()
-    if known.own is None:
-        known.own = _Own()
-    own: _Own = known.own
-    return own
+_importing: list[tuple[Source, list[tuple[Any, str]]]] = []
+"""The plugins that are being imported, and what each has handed to `register`, with file and line."""
 
 
 def loaded() -> list[Loaded]:
     """Return the plugins that were loaded by path in this process."""
-    return list(_own().loaded.values())
+    return list(registry.load().by_path.values())
 
 
 def of_distribution(name: str) -> Loaded | None:
     """Return the plugin by path that the registry knows under a name in the place of a distribution's."""
-    return _own().loaded.get(name)
+    plugin: Loaded | None = registry.load().by_path.get(name)
+    return plugin
 
 
 def is_loading() -> bool:
     """Return whether a plugin by path is being imported at this moment."""
-    return _own().handed is not None
+    return bool(_importing)
 
 
 def modules() -> set[str]:
     """Return the names of the top-level modules of plugins by path."""
-    return {each.source.module for each in loaded()}
+    return {name for each in loaded() for name in each.source.modules}
+
+
+@cache
+def _cache() -> Path:
+    """Return the folder of copies: below `QRLSUITE_CACHE` or the user's cache folder, else a temporary one."""
+    for base in (os.environ.get("QRLSUITE_CACHE"), os.environ.get("XDG_CACHE_HOME") or "~/.cache"):
+        folder = Path(base or "~/.cache").expanduser() / "qrlsuite" / "plugins"
+        with contextlib.suppress(OSError, RuntimeError):
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+    return Path(tempfile.mkdtemp(prefix="qrlsuite-plugins-"))
+
+
+def copy(source: Source, folder: Path) -> Path:
+    """Have a plugin's content in a subfolder that is named by it, whatever is there; return the plugin's path there.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be written.
+    """
+    place = folder / source.mark
+
+    def is_there() -> bool:
+        found = {file.relative_to(place).as_posix(): file.read_bytes() for file in walk(place)}
+        return found == dict(source.files)
+
+    try:
+        if not is_there():
+            shutil.rmtree(place, ignore_errors=True)
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix=f".{source.mark}-", dir=folder) as draft:
+                for name, content in source.files.items():
+                    file = Path(draft, source.mark, name)
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    file.write_bytes(content)
+                with contextlib.suppress(OSError):  # another process was first
+                    Path(draft, source.mark).rename(place)
+                if not is_there():
+                    raise OSError("is not what was written")
+    except OSError as error:
+        raise PluginError(f"{place} cannot be written: {error.strerror or error}") from None
+    return place / source.name
 
 
 def read(path: str | os.PathLike[str]) -> Source:
-    """Read a plugin's file, or all files of its package's folder; imports nothing.
+    """Read a plugin's file with all that belongs to it, or all files of its package's folder; imports nothing.
 
     Raises
     ------
@@ -157,7 +190,7 @@ def read(path: str | os.PathLike[str]) -> Source:
     elif place.suffix != ".py":
         raise PluginError(_no_plugin(shown, place))
     else:
-        files = {place.name: _bytes(shown, place)}
+        files = _file(shown, place)
     name = place.name.removesuffix(".py")
     if not name.isidentifier() or keyword.iskeyword(name):
         usable = "".join(c if c.isalnum() else "_" for c in name).strip("_") or "plugin"
@@ -173,7 +206,7 @@ def _no_plugin(shown: str, place: Path) -> str:
         near = place.with_name(f"{place.name}.py")
         return f"there is no plugin {shown}" + (f"; did you mean {near.name}?" if near.is_file() else "")
     if place.suffix == ".ipynb":
-        return f"plugin {shown} is a notebook: call qrlsuite.register in a cell of it, or save the cell as a .py file"
+        return f"plugin {shown} is a notebook: begin the cell with %%writefile mine.py, and give that file"
     return (
         f"plugin {shown}: give a Python file, or the folder of a package (the one with __init__.py) or of a project "
         "with one package in src"
@@ -201,20 +234,103 @@ def _package_of(folder: Path | None, path: str) -> str:
         return place.name
 
 
-def _folder(shown: str, place: Path) -> dict[str, bytes]:
-    found: dict[str, bytes] = {}
-    for folder, folders, names in os.walk(place):
+def walk(folder: Path) -> Iterator[Path]:
+    """Yield the files of a package in order, without caches, hidden files and links."""
+    for path, folders, names in os.walk(folder):
         folders[:] = sorted(each for each in folders if each != "__pycache__" and not each.startswith("."))
-        for name in sorted(names):
-            file = Path(folder) / name
-            if name.startswith(".") or not file.is_file() or file.is_symlink():
-                continue
-            found[file.relative_to(place.parent).as_posix()] = _bytes(shown, file)
-            if len(found) > MOST_FILES or sum(map(len, found.values())) > MOST_BYTES:
-                raise PluginError(
-                    f"plugin {shown} has more than {MOST_FILES} files or {MOST_BYTES >> 20} MB: give a folder of code"
-                )
-    return found
+        for file in (Path(path, name) for name in sorted(names) if not name.startswith(".")):
+            if file.is_file() and not file.is_symlink():
+                yield file
+
+
+def _folder(shown: str, place: Path) -> dict[str, bytes]:
+    files: dict[str, bytes] = {}
+    for file in walk(place):
+        files[file.relative_to(place.parent).as_posix()] = _bytes(shown, file)
+        _require_small(shown, files)
+    return files
+
+
+def _require_small(shown: str, files: Mapping[str, bytes]) -> None:
+    if len(files) > MOST_FILES or sum(map(len, files.values())) > MOST_BYTES:
+        raise PluginError(
+            f"plugin {shown} has more than {MOST_FILES} files or {MOST_BYTES >> 20} MB: give a folder of code"
+        )
+
+
+def _file(shown: str, place: Path) -> dict[str, bytes]:
+    """Return a file, the modules and packages beside it that it imports, and the data that these declare."""
+    files: dict[str, bytes] = {}
+    left = {place.name: _bytes(shown, place)}
+    while left:
+        name, content = left.popitem()
+        files[name] = content
+        _require_small(shown, files)
+        try:
+            tree = ast.parse(content if name.endswith(".py") else b"")
+        except (SyntaxError, ValueError):  # is said where it is imported
+            continue
+        found: dict[str, bytes] = {}
+        for module in set(_imports(tree)):
+            file, folder = place.with_name(f"{module}.py"), place.with_name(module)
+            if file.is_file() and _is_beside(module, place.parent):
+                found[file.name] = _bytes(shown, file)
+            elif (folder / "__init__.py").is_file() and _is_beside(module, place.parent):
+                found |= _folder(shown, folder)
+        for data in _declared(tree):
+            file = (place.parent / name).parent / data
+            if not file.resolve().is_relative_to(place.parent.resolve()):
+                raise PluginError(f"plugin {shown}: files names {data}, which is not in {place.parent}")
+            found[file.relative_to(place.parent).as_posix()] = _bytes(
+                f"{shown}: files names {data}, and it", file
+            )
+        left |= {file: content for file, content in found.items() if file not in files}
+    return files
+
+
+def _imports(tree: ast.Module) -> Iterator[str]:
+    """Yield the names of the top-level modules that code imports anywhere."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module.partition(".")[0]
+
+
+def _declared(tree: ast.Module) -> Iterator[str]:
+    """Yield the names in a list `files` at the top level of a module."""
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        value = getattr(node, "value", None)
+        if any(getattr(each, "id", None) == "files" for each in targets) and isinstance(value, ast.List):
+            yield from (str(each.value) for each in value.elts if isinstance(each, ast.Constant))
+
+
+def _is_beside(module: str, folder: Path) -> bool:
+    """Return whether an import of a module means the one in a folder: Python has no other of its name."""
+    if module in sys.stdlib_module_names or module in _installed():
+        return False
+    spec = _found(module)
+    if spec is None or spec.origin is None or _is_copy(spec.origin):
+        return True
+    place = Path(spec.origin).resolve()
+    if place.parent in (Path.cwd(), Path.cwd() / "__pycache__"):  # from where workers do not import
+        return True
+    return place in (folder.resolve() / f"{module}.py", folder.resolve() / module / "__init__.py")
+
+
+def _installed() -> set[str]:
+    """Return the top-level modules of installed plugins, the suite's own among them."""
+    known = registry.load()
+    return {
+        each.module.partition(":")[0].partition(".")[0]
+        for each in known.plugins
+        if each.distribution not in known.by_path
+    }
+
+
+def _is_copy(file: str) -> bool:
+    return Path(file).is_relative_to(_cache())
 
 
 def _bytes(shown: str, path: Path) -> bytes:
@@ -268,93 +384,80 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
     for path in paths:
         if not beside_results:
             load(os.path.relpath(folder / path) if folder is not None else path)
-        elif _package_of(folder, path) not in _own().loaded:
+        elif of_distribution(_package_of(folder, path)) is None:
             raise FileError(
                 f"{source}: plugins: what lies beside results is not imported on the word of a file there; if you "
                 f"trust it, add --plugin {os.path.join(folder or '', path)}"
             )
 
 
-def load_source(source: Source, cell: bool = False, things: Sequence[tuple[Any, str]] = ()) -> Loaded:
-    """Like `load`, with content that was read before.
-
-    Parameters
-    ----------
-    cell:
-        See `Loaded`.
-    things:
-        Things to register, each with the caller's file and line: specs, or names in the module. If empty, the module
-        registers them itself.
-    """
-    own, known = _own(), registry.load()
-    before = next((each for each in own.loaded.values() if each.source.module == source.module), None)
-    if before is not None:
-        if (before.source.mark, before.source.name) == (source.mark, source.name):
-            return before
-        if before.source.path != source.path and not (cell and before.cell):
-            raise PluginError(
-                f"two plugins are called {source.module}: {before.source.path} and {source.path}; rename one of them"
-            )
-        _leave(own, known, before)
-    else:
+def load_source(source: Source) -> Loaded:
+    """Like `load`, with content that was read before."""
+    known = registry.load()
+    before: Loaded | None = next((each for each in loaded() if each.source.module == source.module), None)
+    if before is None:
         _require_free(source)
-    kept = {name: sys.modules.pop(name) for name in _names(source)}
+    elif (before.source.mark, before.source.name) == (source.mark, source.name):
+        return before
+    elif before.source.path != source.path:
+        raise PluginError(
+            f"two plugins are called {source.module}: {before.source.path} and {source.path}; rename one of them"
+        )
+    _require_alike(source)
+    if before is not None:
+        unload(before)
     try:
-        return _load(own, known, source, cell, things)
+        made = _load(known, source)
     except BaseException:
-        known.remove(source.name)
-        _forget(source)
-        sys.modules.update(kept)
         if before is not None:
-            _sources[before.source.module] = before.source
-            if before.source.module in kept:
-                known.collect(kept[before.source.module], before.source.name)
-            _enter(own, known, before)
+            _load(known, before.source)
         raise
-
-
-def _load(
-    own: _Own, known: Registry, source: Source, cell: bool, things: Sequence[tuple[Any, str]]
-) -> Loaded:
-    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Finder())
-    _sources[source.module] = source
-    outer, own.handed = own.handed, []
-    try:
-        module = importlib.import_module(source.module)
-        given = own.handed
-    except (Exception, SystemExit) as error:
-        raise PluginError(_failure(source, error)) from error
-    finally:
-        own.handed = outer
-    named = [(getattr(module, t) if isinstance(t, str) else t, place) for t, place in things]
-    registered = [_registered(thing, module, source, place) for thing, place in named or given]
-    if _has_hooks(module):
-        registered += known.collect(module, source.name)
-    elif not registered:
-        registered = [
-            _registered(thing, module, source, _place(thing)) for thing in shortforms.recognized(module)
-        ]
-        if not registered:
-            lacking = shortforms.lacking(shortforms.public(module))
-            advice = (
-                "write a function (qubits, layers) that returns a Circuit, a torch.nn.Module, gymnasium.Env or "
-                "algorithm class, or call qrlsuite.register(...)"
-            )
-            raise PluginError(f"{source.path} registers nothing: {lacking or advice}")
-    _require_unique(known, registered)
-    made = Loaded(source, Plugin(source.module, str(source.path), source.name), registered, cell)
-    _enter(own, known, made)
     known.announce(made.sentence)
     return made
 
 
-def _enter(own: _Own, known: Registry, each: Loaded) -> None:
-    each.plugin.registered = known.add(each.registered)
-    known.plugins.append(each.plugin)
-    own.loaded[each.source.name] = each
+def _load(known: Registry, source: Source) -> Loaded:
+    """Import a plugin's copy, and register its things, or nothing of it."""
+    handed: list[tuple[Any, str]] = []
+    _importing.append((source, handed))
+    _forget(source)  # what Python may have imported from elsewhere
+    sys.path.insert(0, str(source.copy.parent))
+    try:
+        module = importlib.import_module(source.module)
+        registered = [_registered(thing, module, source, place) for thing, place in handed]
+        if _has_hooks(module):
+            registered += known.collect(module, source.name)
+        elif not registered:
+            registered = _recognized(module, source)
+        registered = [replace(each, place=_shown(each.place)) for each in registered]
+        _require_unique(known, registered)
+    except BaseException as error:
+        known.remove(source.name)
+        _forget(source)
+        if isinstance(error, Exception | SystemExit):
+            raise PluginError(_failure(source, error)) from error
+        raise
+    finally:
+        _importing.pop()
+    made = Loaded(source, Plugin(source.module, str(source.path), source.name), registered)
+    made.plugin.registered = known.add(registered)
+    known.plugins.append(made.plugin)
+    known.by_path[source.name] = made
     if "gymnasium" in sys.modules:
         qrlsuite._register(known)
+    return made
+
+
+def _recognized(module: ModuleType, source: Source) -> list[Registered[Any]]:
+    """Return the short forms in a module."""
+    if short := shortforms.recognized(module):
+        return [_registered(thing, module, source, _place(thing)) for thing in short]
+    advice = (
+        "write a function (qubits, layers) that returns a Circuit, a torch.nn.Module, gymnasium.Env or algorithm "
+        "class, or call qrlsuite.register(...)"
+    )
+    lacking = shortforms.lacking(shortforms.public(module))
+    raise PluginError(f"{source.path} registers nothing: {lacking or advice}")
 
 
 def _registered(thing: Any, module: ModuleType, source: Source, place: str) -> Registered[Any]:
@@ -392,60 +495,68 @@ def _require_unique(known: Registry, new: Sequence[Registered[Any]]) -> None:
         seen[key] = each
 
 
+def _require_alike(source: Source) -> None:
+    """Refuse a plugin that brings a module of the name of another plugin's, and of other content."""
+    for other in (each.source for each in loaded()):
+        for name in source.files.keys() & other.files.keys():
+            places = source.place(name), other.place(name)
+            if name.endswith(".py") and source.files[name] != other.files[name] and places[0] != places[1]:
+                raise PluginError(
+                    f"{places[0]} and {places[1]} are two modules of one name: rename one of them"
+                )
+
+
 def _require_free(source: Source) -> None:
-    """Refuse a plugin whose module has the name of another module."""
-    name = source.module
-    if source.name in {each.distribution for each in registry.load().plugins}:
-        raise PluginError(f"{source.path}: there is an installed plugin {source.name}: rename this one")
-    there = sys.modules.get(name)
-    spec = getattr(there, "__spec__", None) if there is not None else _found(name)
-    origin = getattr(spec, "origin", None)
-    if spec is None and name not in sys.stdlib_module_names:
-        return
-    if origin is not None and os.path.realpath(origin) in {
-        os.path.realpath(source.place(f)) for f in source.files
-    }:
-        distributions = {
-            each.distribution for each in registry.load().plugins if each.module.partition(":")[0] == name
-        }
-        if distributions:
+    """Refuse a plugin whose module has the name of another module, or of an installed plugin."""
+    known, name = registry.load(), source.module
+    for each in known.plugins:
+        if name == each.module.partition(":")[0] or source.name == each.distribution:
             raise PluginError(
-                f"{source.path} is installed already, as {min(distributions)}: leave --plugin out"
+                f"{source.path}: {name} is installed, as {each.distribution}: leave --plugin out, or rename this one"
             )
-        return
-    if _beside(origin):
-        return
-    raise PluginError(
-        f"{source.path}: Python has another module '{name}' ({origin or 'built-in'}): rename this one, for example "
-        f"my_{name}"
-    )
-
-
-def _beside(origin: str | None) -> bool:
-    """Return whether a module is one of the folder where Python was started, which workers do not import from."""
-    return origin is not None and Path(origin).parent in (Path.cwd(), Path.cwd() / "__pycache__")
+    if not _is_beside(name, source.path.parent):
+        origin = getattr(_found(name), "origin", None) or "built-in"
+        raise PluginError(
+            f"{source.path}: Python has another module '{name}' ({origin}): rename this one, for example my_{name}"
+        )
 
 
 def _found(module: str) -> ModuleSpec | None:
     """Return where Python finds a module; a folder without code is none."""
-    spec = importlib.util.find_spec(module)
+    try:
+        spec = importlib.util.find_spec(module)
+    except ValueError:  # `__main__`
+        return None
     return None if spec is not None and spec.origin is None else spec
 
 
-def is_free(module: str) -> bool:
-    """Return whether a plugin's module may have a name: one that no module has which is not a plugin's by path."""
-    if module in modules():
-        return True
-    return module not in {*sys.stdlib_module_names, *sys.modules} and _found(module) is None
+def _sources() -> list[Source]:
+    """Return the plugins that are loaded, or are being imported."""
+    return [*(source for source, _ in _importing), *(each.source for each in loaded())]
+
+
+def _shown(text: str) -> str:
+    """Return a text with the user's paths in place of those of copies."""
+    for source in _sources():
+        text = text.replace(f"{source.copy.parent}{os.sep}", f"{source.path.parent}{os.sep}")
+    return text
+
+
+def _words(error: BaseException) -> str:
+    """Return an error of a plugin's code in words, in a line."""
+    more = ""
+    if isinstance(error, FileNotFoundError) and _is_copy(str(error.filename)):
+        file = Path(error.filename).name
+        more = f'; no such file belongs to the plugin: declare it at the top of the code, files = ["{file}"]'
+    return _shown(" ".join(registry.words(error).split())[:_MOST_WORDS] + more)
 
 
 def failure(error: BaseException) -> str:
     """Return the error of a plugin's code with its line, in words."""
-    what = " ".join(registry.words(error).split())
     if not (where := place(error)):
         last = traceback.extract_tb(error.__traceback__)[-1:]
         where = "".join(f"{frame.filename}, line {frame.lineno}" for frame in last)
-    return f"{what[:_MOST_WORDS]} ({where})" if where else what[:_MOST_WORDS]
+    return f"{_words(error)} ({where})" if where else _words(error)
 
 
 def place(error: BaseException) -> str:
@@ -464,17 +575,12 @@ def place_of(function: Any) -> str:
 
 def _line(file: str, module: Any, line: int) -> str:
     """Return a line of a plugin by path or an installed one: `ring.py, line 9: return x`; `""` where it is of none."""
-    for source in (each.source for each in loaded()):
-        for name in source.files:
-            if source.place(name) == file:
-                text = source.files[name].decode(errors="replace").splitlines()[line - 1 : line]
-                return f"{name}, line {line}" + "".join(f": {each.strip()}" for each in text)
-    installed = {
-        each.module.partition(":")[0].partition(".")[0]
-        for each in registry.load().plugins
-        if each.distribution != hookspecs.PROJECT
-    }
-    if str(module).partition(".")[0] not in installed:
+    for source in _sources():
+        if Path(file).is_relative_to(source.copy.parent):
+            name = Path(file).relative_to(source.copy.parent).as_posix()
+            text = source.files[name].decode(errors="replace").splitlines()[line - 1 : line]
+            return f"{name}, line {line}" + "".join(f": {each.strip()}" for each in text)
+    if str(module).partition(".")[0] not in _installed() - {hookspecs.PROJECT}:
         return ""
     return f"{file}, line {line}: {linecache.getline(file, line).strip()}"
 
@@ -510,43 +616,20 @@ def blamed() -> Iterator[None]:
 def _failure(source: Source, error: BaseException) -> str:
     """Say where and why a plugin could not be imported, in one line."""
     if isinstance(error, PluginError):
-        return str(error)
-    names = {source.place(file) for file in source.files}
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in names]
+        return _shown(str(error))
+    if isinstance(error, SyntaxError) and _is_copy(str(error.filename)):
+        return _shown(f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}")
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_copy(f.filename)]
     place = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else str(source.path)
-    if isinstance(error, SyntaxError) and error.filename in names:
-        return f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}"
-    more = ""
-    if isinstance(error, ModuleNotFoundError) and (name := (error.name or "").partition(".")[0]):
-        beside = source.path.with_name(f"{name}.py")
-        if beside.is_file():
-            more = f": {beside.name} is another plugin: name it before this one, or make a package's folder of both"
-    return f"{place}: {' '.join(registry.words(error).split())}{more}"
-
-
-def _leave(own: _Own, known: Registry, each: Loaded) -> None:
-    known.remove(each.source.name)
-    known.plugins.remove(each.plugin)
-    del own.loaded[each.source.name]
-    gymnasium, lanes = sys.modules.get("gymnasium"), sys.modules.get("qrlsuite.gymlanes")
-    for spec in (one.spec for one in each.registered if isinstance(one.spec, specs.EnvironmentSpec)):
-        if gymnasium is not None and spec.entry_point is not None:
-            gymnasium.registry.pop(spec.gymnasium_id, None)
-        if lanes is not None:
-            lanes.random_returns.cache_clear()
-    _sources.pop(each.source.module, None)
-
-
-def _names(source: Source) -> list[str]:
-    """Return the names of a plugin's modules that are imported."""
-    return [name for name in sys.modules if name.partition(".")[0] == source.module]
+    return f"{_shown(place)}: {_words(error)}"
 
 
 def _forget(source: Source) -> None:
     """Have a plugin's modules be imported no more."""
-    _sources.pop(source.module, None)
-    for name in _names(source):
+    for name in [name for name in sys.modules if name.partition(".")[0] in source.modules]:
         del sys.modules[name]
+    if str(source.copy.parent) in sys.path:
+        sys.path.remove(str(source.copy.parent))
 
 
 def register(thing: Any, place: str) -> bool:
@@ -557,11 +640,9 @@ def register(thing: Any, place: str) -> bool:
     place:
         File and line of who asked for it.
     """
-    own = _own()
-    if own.handed is None:
-        return False
-    own.handed.append((thing, place))
-    return True
+    if _importing:
+        _importing[-1][1].append((thing, place))
+    return bool(_importing)
 
 
 Thing = TypeVar("Thing")
@@ -576,55 +657,14 @@ def note(thing: Thing) -> Thing:
 
 def unload(each: Loaded) -> None:
     """Forget a plugin by path."""
-    _leave(_own(), registry.load(), each)
+    known = registry.load()
+    known.remove(each.source.name)
+    known.plugins.remove(each.plugin)
+    del known.by_path[each.source.name]
+    gymnasium, lanes = sys.modules.get("gymnasium"), sys.modules.get("qrlsuite.gymlanes")
+    for spec in (one.spec for one in each.registered if isinstance(one.spec, specs.EnvironmentSpec)):
+        if gymnasium is not None and spec.entry_point is not None:
+            gymnasium.registry.pop(spec.gymnasium_id, None)
+        if lanes is not None:
+            lanes.random_returns.cache_clear()
     _forget(each.source)
-
-
-_sources: dict[str, Source] = {}
-
-
-class _Finder(importlib.abc.MetaPathFinder):
-    """Finds the modules of plugins by path."""
-
-    def find_spec(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        """Return the spec of a module that a plugin has, None for any other."""
-        source = _sources.get(name.partition(".")[0])
-        if source is None:
-            return None
-        place = name.replace(".", "/")
-        for file, package in ((f"{place}/__init__.py", True), (f"{place}.py", False)):
-            if file in source.files:
-                origin = source.place(file)
-                folders = [str(PurePosixPath(origin).parent)] if package else None
-                return importlib.util.spec_from_file_location(
-                    name, origin, loader=_Loader(name, origin, source), submodule_search_locations=folders
-                )
-        return None
-
-
-class _Loader(SourceFileLoader):
-    """Imports the content that was read; leaves no compiled files."""
-
-    def __init__(self, name: str, path: str, source: Source) -> None:
-        super().__init__(name, path)
-        self._files = {source.place(file): content for file, content in source.files.items()}
-
-    def get_data(self, path: str) -> bytes:
-        """Return a file's content when the plugin was read."""
-        known = self._files.get(os.fspath(path))
-        return super().get_data(path) if known is None else known
-
-    def path_stats(self, path: str) -> Any:
-        """Say that there is no time of change, so that nothing compiled is looked for or written."""
-        raise OSError(f"{path} was read before")
-
-
-def write(source: Source, folder: Path) -> Path:
-    """Write a plugin's content into a folder; return the path of the plugin there."""
-    for name, content in source.files.items():
-        file = folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(content)
-    return folder / source.name

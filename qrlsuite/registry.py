@@ -91,8 +91,8 @@ class Registry:
     plugins: list[Plugin] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     strict: bool = False
-    own: Any = None
-    """Data of `qrlsuite.own` on plugins loaded by path."""
+    by_path: dict[str, Any] = field(default_factory=dict)
+    """The plugins that `qrlsuite.own` has loaded by path, by the name that stands for their distribution."""
     announce: Callable[[str], None] = lambda line: None
     """Called with a line for the user when a plugin has been loaded by path."""
     on_backends: list[Registered[specs.ModelSpec]] = field(default_factory=list)

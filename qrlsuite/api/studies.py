@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.console import Console
 
-from qrlsuite import own, registry, specs
+from qrlsuite import registry, specs
 from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
 from qrlsuite.engine import missing
 from qrlsuite.engine.terminal import command
@@ -105,14 +105,8 @@ def new_study(
 
 def _plugins_of(study: StudyWithLooks, file: Path) -> str:
     """Return the line that names the plugins by path of a study's entries, relative to its file; `""` without any."""
-    used = {
-        source.path: source.name for entry in study.entries.values() for source in identity.plugins(entry)
-    }
-    paths = [
-        Path(os.path.relpath(path, file.absolute().parent)).as_posix()
-        for path, name in sorted(used.items())
-        if (known := own.of_distribution(name)) is not None and not known.cell
-    ]
+    used = {source.path for entry in study.entries.values() for source in identity.plugins(entry)}
+    paths = [Path(os.path.relpath(path, file.absolute().parent)).as_posix() for path in sorted(used)]
     return f"plugins = {json.dumps(paths)}\n\n" if paths else ""
 
 

@@ -174,12 +174,10 @@ def in_fresh_process(
         "device": device,
         "start": start and str(start),
     }
-    task["plugins"] = []
+    task["plugins"] = [str(plugin.copy) for plugin in identity.plugins(entry)]
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as output:
         answer = Path(folder) / "answer"
-        for plugin in identity.plugins(entry):
-            task["plugins"].append(str(own.write(plugin, Path(folder) / plugin.mark)))
         (Path(folder) / "task").write_text(json.dumps(task))
         with (Path(folder) / "task").open("rb") as given:
             process = subprocess.Popen(

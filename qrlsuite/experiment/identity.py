@@ -3,12 +3,14 @@
     part                      content of its identity
     of the suite itself       its `numerics`, which is raised when its bits change; not its source
     a circuit                 its description, as built: gates, wires, angles, parameters (`canonical`)
-    a plugin's other parts    the syntax trees of the modules that its code reaches by imports within its distribution
+    a plugin's other parts    the syntax trees of the modules that its code reaches by imports within its distribution;
+                              of an environment, the distribution's data as well
+    their package             all other files that it installs, or that belong to the plugin by path
     a file that an option     its bytes
     names
 
 The parts as canonical JSON give the digest, 16 hexadecimal digits of SHA-256. Engines, trackers and rules compute
-nothing of an entry.
+nothing of an entry. Tests and documents of a package are no part of it.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.machinery import ModuleSpec
@@ -85,23 +87,27 @@ def of(entry: Entry) -> CodeIdentity:
         _part(role, each, circuit_of(entry) if role == "ansatz" else None, _environment_id(entry, role))
         for role, each in entry.registered().items()
     ]
-    return CodeIdentity((*parts, *_files(entry)))
+    return CodeIdentity((*parts, *_packages(entry, parts), *_files(entry)))
 
 
 def plugins(entry: Entry) -> list[own.Source]:
     """Return the plugins by path whose code makes an entry's numbers, or watches its training."""
-    roots = {
-        reference.partition(":")[0]
-        for role, each in entry.registered().items()
-        for name in _CODE[role]
-        if (reference := getattr(each.spec, name)) is not None
-    }
+    needed = _by_path(root for role, each in entry.registered().items() for root in _roots(role, each))
+    watching = {each.distribution for each in registry.load().of(specs.TrackerSpec).values()}
+    return [each.source for each in own.loaded() if each.source in needed or each.source.name in watching]
+
+
+def _roots(role: str, each: registry.Registered[specs.NumericSpec]) -> list[str]:
+    """Return the modules that a registered thing refers to."""
+    references = [getattr(each.spec, name) for name in _CODE[role]]
+    return [reference.partition(":")[0] for reference in references if reference is not None]
+
+
+def _by_path(roots: Iterable[str]) -> list[own.Source]:
+    """Return the plugins by path that modules reach: one may import another."""
     reached = source.reached(roots, lambda name, spec: name in own.modules())
     needed = {Path(file).parts[0].removesuffix(".py") for file in reached}
-    watching = {each.distribution for each in registry.load().of(specs.TrackerSpec).values()}
-    return [
-        each.source for each in own.loaded() if each.source.module in needed or each.source.name in watching
-    ]
+    return [each.source for each in own.loaded() if each.source.module in needed]
 
 
 def numerics(entry: Entry) -> dict[str, int]:
@@ -149,10 +155,26 @@ def _part(
         owner = metadata.packages_distributions().get(module.partition(".")[0], ["unknown"])[0]
         return {"role": role, "name": gym, "distribution": owner, "files": _modules([module], owner)}
     if each.distribution != OURS:
-        references = [getattr(each.spec, name) for name in _CODE[role]]
-        roots = [reference.partition(":")[0] for reference in references if reference is not None]
-        part["files"] = _modules(roots, each.distribution)
+        roots = _roots(role, each)
+        files = _modules(roots, each.distribution)
+        if role == "environment":  # scores of another game cannot be compared
+            of_package = _installed(roots, each.distribution)
+            files |= {file: code for file, code in of_package.items() if not file.endswith(".py")}
+        part["files"] = dict(sorted(files.items()))
     return part
+
+
+def _packages(entry: Entry, parts: Sequence[Part]) -> Iterator[Part]:
+    """Yield, of every plugin whose code computes, a part with the files that are in none of the others."""
+    roots: dict[str, list[str]] = {}
+    for (role, each), part in zip(entry.registered().items(), parts, strict=True):
+        if "files" in part and each.distribution != OURS:
+            roots.setdefault(each.distribution, []).extend(_roots(role, each))
+    covered = {file for part in parts for file in part.get("files", ())}
+    for distribution, modules in roots.items():
+        of_package = _installed(modules, distribution)
+        if files := {file: code for file, code in of_package.items() if file not in covered}:
+            yield {"role": "package", "name": distribution, "distribution": distribution, "files": files}
 
 
 def _environment_id(entry: Entry, role: str) -> str | None:
@@ -177,7 +199,7 @@ def _gymnasium_module(env_id: str) -> str | None:
 def _modules(roots: Sequence[str], distribution: str) -> dict[str, str]:
     """Return the modules that roots reach within their distribution; without one, within their own folder."""
     tops = {root.partition(".")[0] for root in roots}
-    if own.of_distribution(distribution) is not None:  # one plugin by path may import another
+    if own.of_distribution(distribution) is not None:
         paths = own.modules()
         return source.reached(roots, lambda name, spec: name in paths)
     listed = _listed(distribution)
@@ -189,6 +211,21 @@ def _modules(roots: Sequence[str], distribution: str) -> dict[str, str]:
     return source.reached(roots, belongs)
 
 
+def _installed(roots: Sequence[str], distribution: str) -> dict[str, str]:
+    """Return all files that a plugin by path has, or that a distribution installs in its packages."""
+    if own.of_distribution(distribution) is not None:
+        files = {name: content for each in _by_path(roots) for name, content in each.files.items()}
+        return source.digests(files)
+    found = {}
+    for top in {root.partition(".")[0] for root in roots} | _listed(distribution):
+        spec = source.find(top)
+        if spec is not None and spec.origin is not None and spec.submodule_search_locations is not None:
+            folder = Path(spec.origin).parent
+            for path in own.walk(folder):
+                found[f"{top}/{path.relative_to(folder).as_posix()}"] = path.read_bytes()
+    return source.digests(found)
+
+
 def _listed(distribution: str) -> set[str]:
     """Return the top-level modules that a distribution says that it has."""
     try:
@@ -197,7 +234,10 @@ def _listed(distribution: str) -> set[str]:
         return set()
     words = (found.read_text("top_level.txt") or "").split()
     files = [file for file in found.files or () if file.suffix == ".py"]
-    return {*words, *(file.parts[0].partition(".")[0] for file in files)}
+    names = {*words, *(file.parts[0].partition(".")[0] for file in files)}
+    return {
+        name for name in names if not name.startswith("__editable__")
+    }  # which names a folder of this machine
 
 
 def _place(spec: ModuleSpec) -> Path | None:

@@ -1,4 +1,4 @@
-"""Reads code by its effect: canonical syntax trees, and the modules that imports reach.
+"""Reads code by its effect: canonical syntax trees, the modules that imports reach, and the files of a package.
 
 A tree is written by a walk of our own: empty fields do not count, so that fields which later versions of Python added
 change nothing. Only the standard library is imported here; a module that is read is not imported.
@@ -8,10 +8,18 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.machinery import ModuleSpec
 from typing import Any
+
+_APART = re.compile(
+    r"(^|/)((tests?|docs?)/|(test_[^/]*|[^/]*_test|conftest)\.py$|py\.typed$|[^/]*\.pyi$"
+    r"|(readme|license|licence|changelog|notice|authors)(\.\w+)?$)",
+    re.IGNORECASE,
+)
+"""Tests and documents: nothing that is trained depends on these files of a package."""
 
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -168,13 +176,28 @@ def _file(spec: ModuleSpec) -> str:
 
 def _read(content: bytes, spec: ModuleSpec) -> tuple[str, list[str]]:
     """Return a module's SHA-256, and the names of the modules that it imports anywhere."""
-    if not str(spec.origin).endswith(".py"):
-        return hashlib.sha256(content).hexdigest(), []
+    tree = _tree(content, str(spec.origin))
+    return _digest(content, tree), [] if tree is None else list(_imports(tree, spec))
+
+
+def _tree(content: bytes, name: str) -> ast.Module | None:
     try:
-        tree = ast.parse(content)
+        return ast.parse(content) if name.endswith(".py") else None
     except (SyntaxError, ValueError):  # what this Python cannot read, it does not run
-        return hashlib.sha256(content).hexdigest(), []
-    return hashlib.sha256(_walked(tree)).hexdigest(), list(_imports(tree, spec))
+        return None
+
+
+def _digest(content: bytes, tree: ast.Module | None) -> str:
+    return hashlib.sha256(content if tree is None else _walked(tree)).hexdigest()
+
+
+def digests(files: Mapping[str, bytes]) -> dict[str, str]:
+    """Return the SHA-256 of a package's files, without tests and documents; of a Python file, that of its tree."""
+    return {
+        name: _digest(content, _tree(content, name))
+        for name, content in sorted(files.items())
+        if not _APART.search(name)
+    }
 
 
 def _imports(tree: ast.Module, spec: ModuleSpec) -> Iterator[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import datetime
 import os
-import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -247,23 +246,9 @@ def contents(record: EntryRecord, digests: Iterable[str]) -> dict[str, frozenset
 
 def _copied(store: EntryStore, plugin: own.Source) -> str:
     """Copy a plugin into an entry's folder, whatever is there in its place; returns where it is in that folder."""
-    place = f"{PLUGINS}/{plugin.mark}/{plugin.name}"
-    folder = store.path / PLUGINS / plugin.mark
-    try:
-        genuine.require_no_link(store.path, store.path / PLUGINS, folder, folder / plugin.name)
-        if not folder.is_dir() or own.read(folder / plugin.name).mark != plugin.mark:
-            raise PluginError("it is not there, or is not what it was")
-    except PluginError:
-        draft = store.path / PLUGINS / f".{plugin.mark}-{os.getpid()}"
-        try:
-            shutil.rmtree(draft, ignore_errors=True)
-            own.write(plugin, draft)
-            shutil.rmtree(folder, ignore_errors=True)
-            draft.rename(folder)
-        except OSError as error:
-            shutil.rmtree(draft, ignore_errors=True)
-            raise StoreError(f"{folder} cannot be written: {error.strerror or error}") from None
-    return place
+    folder = store.path / PLUGINS
+    genuine.require_no_link(store.path, folder, folder / plugin.mark, folder / plugin.mark / plugin.name)
+    return own.copy(plugin, folder).relative_to(store.path).as_posix()
 
 
 def copies(store: EntryStore) -> list[Path]:

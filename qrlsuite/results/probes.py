@@ -67,9 +67,7 @@ def refusal(store: EntryStore, probe: ProbeRecord) -> DependentSeedsError:
     )
     known = registry.load().of(kind)
     loaded = own.of_distribution(known[name].distribution) if name in known else None
-    plugin = (
-        f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None and not loaded.cell else ""
-    )
+    plugin = f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None else ""
     return DependentSeedsError(
         f"seed {probe.seed} depends on its company: trained alone in a fresh process, it differs from the same seed "
         f"in a group in {probe.difference}. So no seed is what it says, and boards leave the entry out. Likely "

@@ -47,6 +47,9 @@ def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
     name:
         Name of the distribution; None takes the name of the file or folder.
     """
+    others = [name for name in own.read(path).files if "/" not in name and name.endswith(".py")][1:]
+    if others:
+        raise ScaffoldError(f"{path} imports {others[0]}: make a package's folder of both")
     made = own.load(path)
     kept = made.registered
     own.unload(made)

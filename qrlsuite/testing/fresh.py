@@ -63,8 +63,8 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
 
 
 def _plugins() -> list[str]:
-    """Return the paths of the plugins that were loaded by path."""
-    return [str(each.source.path) for each in own.loaded()]
+    """Return the copies of the plugins that were loaded by path."""
+    return [str(each.source.copy) for each in own.loaded()]
 
 
 def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:

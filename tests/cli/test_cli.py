@@ -363,7 +363,7 @@ study new p --task tiny.toml mlp 'mlp width=4' => p: a study file's name ends in
 study new 'p q.toml' --task tiny.toml mlp 'mlp width=4' => name
 study new tiny.toml --task tiny.toml mlp 'mlp width=4' => tiny.toml is there already
 new plugin acme-ring => name the package and what it adds, for example acme-ring --kind ansatz
-new plugin --from part.py => ring.py is another plugin: name it before this one
+new plugin --from part.py => part.py imports ring.py: make a package's folder of both
 new plugin --from none.py => there is no plugin none.py
 new plugin --from ring.py --kind ansatz => leave --kind and --range out
 new plugin --from ring.py Ring => 'Ring' cannot be the name of a package

@@ -1,14 +1,12 @@
-"""Plugins by path in this process: what is recognized, what is refused and how, and cells of a notebook."""
+"""Plugins by path in this process: what is recognized, what is refused and how, and what belongs to them."""
 
 from __future__ import annotations
 
-import linecache
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -405,133 +403,123 @@ def test_a_published_study_imports_nothing() -> None:
     assert "what lies beside results is not imported" in line
 
 
-@pytest.fixture
-def cell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Run cells as a notebook does: in `__main__`, with their source where Python looks for it."""
-    main = ModuleType("__main__")
-    monkeypatch.setitem(sys.modules, "__main__", main)
-    count = iter(range(1000))
+HELPED = """
+import json
+from pathlib import Path
+import torch
+from helper import wide
 
-    def run(text: str) -> None:
-        text, name = textwrap.dedent(text), f"<cell {next(count)}>"
-        linecache.cache[name] = (len(text), None, text.splitlines(True), name)
-        exec(compile(text, name, "exec", dont_inherit=True), vars(main))
-
-    run("from qrlsuite import api\nfrom qrlsuite.circuit import Circuit\nimport math as m\nGATE = 'RY'\n")
-    return run
+files = ["config.json"]
 
 
-CELL = '''
-def pairs(n):
-    """Neighbors."""
-    return [(q, (q + 1) % n) for q in range(n)] if n > 2 else []
+class Scaled(torch.nn.Module):
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.layer = torch.nn.Linear(wide(inputs), outputs)
+        self.scale = json.loads(Path(__file__).with_name("config.json").read_text())["scale"]
 
-@api.register
-def my_ring(qubits: int, layers: int, depth: int = STEP) -> Circuit:
-    """A ring."""
-    circuit = Circuit(qubits)
-    for q in range(qubits):
-        circuit.append(GATE, q, circuit.input(q))
-        circuit.append("RX", q, m.pi)
-    for pair in pairs(qubits):
-        circuit.append("CZ", pair)
-    return circuit
-'''
+    def forward(self, x):
+        return self.layer(x) * self.scale
+"""
 
 
-def test_a_cell_registers_with_what_it_names(
-    cell: Callable[[str], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    cell("STEP = 2\n")
-    cell(CELL)
-    shown = capsys.readouterr().out
-    assert shown.startswith("my_ring.py: ansatz my-ring\n4 qubits, 2 layers:\n")
-    assert "RY" in shown
-    (made,) = own.loaded()
-    text = made.source.files["my_ring.py"].decode()
-    assert "register" not in text
-    assert text.startswith("from qrlsuite.circuit.description import Circuit\n")
-    assert "GATE = 'RY'\n" in text
-    assert "STEP = 2\n" in text
-    assert len(list(circuit.ansatz("my-ring", 3, 1))) == 9
+def helped(folder: str = ".") -> str:
+    """Write a file with a module beside it and data."""
+    write(f"{folder}/config.json", '{"scale": 2}')
+    write(f"{folder}/helper.py", "from parts.more import times\ndef wide(n): return n * times\n")
+    write(f"{folder}/parts/__init__.py", "")
+    write(f"{folder}/parts/more.py", "times = 1\n")
+    write(f"{folder}/parts/notes.txt", "not imported")
+    write(f"{folder}/stranger.py", "not = read\n")
+    return write(f"{folder}/scaled.py", HELPED)
 
 
-def test_a_cell_may_be_run_again(cell: Callable[[str], None]) -> None:
-    text = CELL.replace("STEP", "1")
-    cell(text)
-    entry = resolve("beam6g", "vqc-native ansatz=my-ring")
+def test_a_file_brings_the_modules_beside_it_that_it_imports_and_the_data_that_it_declares() -> None:
+    made = own.load(helped())
+    parts = {"parts/__init__.py", "parts/more.py", "parts/notes.txt"}
+    assert set(made.source.files) == {"scaled.py", "helper.py", "config.json"} | parts
+    entry = resolve("beam6g", "scaled")
+    before = identity.of(entry)
+    for path in ("config.json", "helper.py", "parts/more.py", "scaled.py"):
+        Path(path).unlink()
+    assert first_network(entry).scale == 2
+    assert identity.of(entry) == before, "what was read runs"
+    assert identity.plugins(entry) == [made.source]
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "counts"),
+    [
+        ("config.json", '{"scale": 30}', True),
+        ("parts/more.py", "times = 2\n", True),
+        (
+            "helper.py",
+            '"""Text."""\nfrom parts.more import times\ndef wide(n): return n * times  # so\n',
+            False,
+        ),
+        ("stranger.py", "x = 1\n", False),
+        ("parts/README.md", "read", False),
+    ],
+)
+def test_the_identity_covers_what_belongs_to_a_file(path: str, text: str, counts: bool) -> None:
+    own.load(helped())
+    entry = resolve("beam6g", "scaled")
     before = identity.of(entry).digest
-    cell(text)
-    assert identity.of(entry).digest == before
-    cell("GATE = 'RZ'\n" + text)
-    assert identity.of(entry).digest != before
-    assert {each.gate for each in circuit.ansatz("my-ring", 3, 1)} == {"RX", "RZ", "CZ"}
-    cell("GATE = 'RY'\n" + text)
-    assert identity.of(entry).digest == before
+    write(path, text)
+    own.load("scaled.py")
+    assert (identity.of(entry).digest != before) == counts
 
 
-def test_a_class_of_a_cell_is_a_model(
-    cell: Callable[[str], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    cell(
-        """
-        import torch
-        from torch import nn
-        SIZES: list[int] = [4, 4]
-        scale = torch.tensor(0.5)
+def test_a_module_of_the_same_name_beside_another_file_is_refused() -> None:
+    own.load(helped("a"))
+    write("b/helper.py", "x = 1\n")
+    said = refusal(write("b/net.py", "import helper\ndef ring(qubits, layers): ...\n"))
+    assert "/b/helper.py and " in said
+    assert "are two modules of one name: rename one of them" in said
 
-        class Base(nn.Module):
-            def forward(self, x):
-                return self.inner(x) * float(scale)
+
+@pytest.mark.parametrize("data", ["../secret", "/etc/hostname", "link"])
+def test_data_outside_of_the_files_folder_is_not_read(data: str) -> None:
+    write("secret", "x")
+    Path("here").mkdir()
+    Path("here/link").symlink_to(Path("secret").absolute())
+    text = f"files = [{data!r}]\ndef ring(qubits, layers): ...\n"
+    assert f"files names {data}, which is not in " in refusal(write("here/ring.py", text))
+
+
+def test_undeclared_data_is_said_with_what_to_write() -> None:
+    write("data.txt", "1")
+    head = "from pathlib import Path\nfrom qrlsuite.circuit import Circuit\n"
+    read = "Path(__file__).with_name('data.txt').read_text()"
+    expected = f"{Path.cwd()}/data.txt'; no such file belongs to the plugin: declare it at the top of the code, files"
+    said = refusal(write("ring.py", f"{head}{read}\ndef ring(qubits, layers) -> Circuit: ...\n"))
+    assert expected in said
+    assert said.startswith(f"{Path.cwd()}/ring.py:3: FileNotFoundError")
+    own.load(write("ring.py", f"{head}def ring(qubits, layers) -> Circuit:\n    return {read}\n"))
+    with pytest.raises(PluginError, match=r'files = \["data.txt"\] \(ring.py, line 4: return Path'):
+        circuit.ansatz("ring", 1, 1)
+    own.load(
+        write("ring.py", f"files = ['data.txt']\n{head}{read}\ndef ring(qubits, layers) -> Circuit: ...\n")
+    )
+    assert "files names none, and it" in refusal(write("net.py", "files = ['none']\n"))
+
+
+def test_a_copy_that_was_changed_is_written_anew() -> None:
+    made = own.load(write("ring.py", RING))
+    own.unload(made)
+    made.source.copy.write_text("raise SystemExit\n")
+    made.source.copy.with_name("math.py").write_text("raise SystemExit\n")
+    assert own.load("ring.py").source.copy.read_text() == RING
+    assert not made.source.copy.with_name("math.py").exists()
+
+
+def test_what_is_not_in_a_file_is_not_registered() -> None:
+    with pytest.raises(
+        PluginError, match=r"^'two' is registered from its file: begin .* with %%writefile mine.py"
+    ):
 
         @api.register
-        class RingNet(Base):
-            def __init__(self, inputs, outputs, width: int = len(SIZES)):
-                super().__init__()
-                self.inner = nn.Linear(inputs, outputs)
-        """
-    )
-    assert "ring_net.py: model ring-net\nclassical, 3 inputs, 3 outputs:\nRingNet(" in capsys.readouterr().out
-    assert resolve("beam6g", "ring-net").model_options.width == 2
-
-
-def test_a_spec_of_a_cell_refers_to_what_the_cell_defines(cell: Callable[[str], None]) -> None:
-    cell(
-        """
-        from qrlsuite import specs
-        def build(qubits, layers, options): return Circuit(qubits)
-        api.register(specs.AnsatzSpec("by-spec", "A spec", "qrlsuite.plugins.circuits.ansatz:NoOptions",
-                                      "__main__:build"))
-        """
-    )
-    assert circuit.ansatz("by-spec", 2, 1).qubits == 2
-
-
-def test_what_workers_could_not_have_is_refused(cell: Callable[[str], None]) -> None:
-    cell("thing = object()\n")
-    head = "@api.register\ndef f(qubits, layers):\n    "
-    for text, expected in (
-        (head + "return thing\n", "'f' uses 'thing', a object, which workers cannot have"),
-        (head + "return late(1)\n\ndef late(x): ...\n", "'f' uses 'late', which is defined after it"),
-        (
-            "@api.register\ndef iqp(qubits, layers): ...\n",
-            r"<cell \d+>:1: ansatz 'iqp' is registered already, by qrl",
-        ),
-        ("api.register(print)\n", "'print' cannot be registered: it is neither a spec"),
-        ("api.register('none.py')\n", "there is no plugin none.py"),
-        (
-            "from qrlsuite.plugins.circuits.ansatz import cx\napi.register(cx)\n",
-            "'cx' is defined in module qrlsuite.",
-        ),
-    ):
-        with pytest.raises(PluginError, match=expected) as caught:
-            cell(text)
-        assert "\n" not in str(caught.value)
-    assert names() == {}
-    with pytest.raises(
-        PluginError, match=r"the source of 'f' cannot be read here .*qrlsuite.register\('f.py'\)"
-    ):
-        exec(head + "return Circuit(qubits)\n", vars(sys.modules["__main__"]))
+        def two(qubits: int, layers: int) -> None: ...
 
 
 def test_a_builder_that_fails_is_named_with_its_line() -> None:
@@ -547,14 +535,6 @@ def test_a_builder_that_fails_is_named_with_its_line() -> None:
         PluginError, match=r"^ansatz 'none' returns NoneType, and must return a Circuit of qrlsuite"
     ):
         resolve("beam6g", "vqc-native ansatz=none")
-
-
-def test_a_clash_with_another_file_names_it(cell: Callable[[str], None]) -> None:
-    own.load(write("other.py", RING.replace("def ring", "def my_ring")))
-    with pytest.raises(
-        PluginError, match=r"<cell \d+>:\d+: ansatz 'my-ring' is registered already, by other.py \("
-    ):
-        cell(CELL.replace("STEP", "1"))
 
 
 def test_a_file_is_registered_from_python(capsys: pytest.CaptureFixture[str]) -> None:
