@@ -1,4 +1,4 @@
-"""TOML files of users and plugins: tasks, presets, studies, grids, speeds. Every error names the file and the place."""
+"""TOML files of users and plugins: tasks, presets, studies, grids. Every error names the file and the place."""
 
 from __future__ import annotations
 

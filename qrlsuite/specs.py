@@ -263,14 +263,11 @@ class StudySpec(Spec):
     ----------
     path:
         Its TOML file (see `qrlsuite.studies.study`).
-    speeds:
-        A TOML file of reference speeds (see `qrlsuite.results.speed`), for estimates before anything was measured.
     """
 
     kind, kinds = "study", "studies"
 
     path: str
-    speeds: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -204,8 +204,9 @@ def _draw(number: int, digest: str, count: int, wanted: int) -> list[int]:
 
 def _cost(made_by: Entry, again: int, count: int, epochs: int) -> str:
     """Return the number of seeds to train again, their cost, and the probability to find a forgery, in words."""
-    known = speed.known(Path("runs")).estimate(made_by, min(again, CHUNK)).range(again * epochs)
-    cost = "not known" if known is None else " to ".join(hours_text(seconds / 3600) for seconds in known)
+    measured = speed.find(made_by, min(again, CHUNK), Path("runs"))
+    span = () if measured is None else measured.range(again * epochs)
+    cost = " to ".join(hours_text(seconds / 3600) for seconds in span) or "not known"
     return f"{again} of {count} seeds are trained again, core-hours {cost}; {_finds(again, count)}"
 
 

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -16,12 +15,9 @@ from qrlsuite.api.arguments import several
 from qrlsuite.api.entries import load
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
-from qrlsuite.errors import OptionError, StoreError, UnknownNameError
+from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import ranked
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results import speed
-from qrlsuite.results.speed import BASES
-from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import hours_text
 from qrlsuite.statistics import MIN_RUNS, LearningCurves, SmoothedRuns
 from qrlsuite.statistics.curves import common_horizon
@@ -44,8 +40,6 @@ class SeedsNeeded(Shown):
         Environment steps.
     needs:
         For each difference and power one row of plain values.
-    basis:
-        Basis of the core-hours.
     draws:
         Simulated pairs of each row.
     """
@@ -53,7 +47,6 @@ class SeedsNeeded(Shown):
     entries: tuple[EntryResults, ...]
     horizon: int
     needs: tuple[dict[str, Any], ...]
-    basis: str
     draws: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -66,12 +59,11 @@ class SeedsNeeded(Shown):
             ],
             "horizon": self.horizon,
             "draws": self.draws,
-            "core_hours_basis": self.basis,
             "needs": list(self.needs),
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show a row for each difference and power, and their basis."""
+        """Show a row for each difference and power."""
         heads = ("difference", "power", "seeds, all at once", "seeds with looks: mean (most)", "its looks")
         rows, before = [], None
         for need in self.needs:
@@ -81,14 +73,12 @@ class SeedsNeeded(Shown):
         yield Sheet.of("", heads, rows, words=("difference", "its looks"))
         pilots = " and ".join(f"{len(entry.seeds)} seeds of {entry.label}" for entry in self.entries)
         error = 100 * (0.8 * 0.2 / self.draws) ** 0.5
-        known = any(need["fixed_core_hours"] or need["mean_core_hours"] for need in self.needs)
         yield Text(
             f"Seeds of each of the two entries, with the core-hours of both. Simulated from {pilots},\n"
             f"{self.horizon} steps, {self.draws} pairs per line (power to within {error:.0f} points or so)."
         )
         if min(len(entry.seeds) for entry in self.entries) < MIN_RUNS:
             yield Text(f"Fewer than {MIN_RUNS} seeds are a weak pilot: rare failures may be missing from it.")
-        yield Text(f"Core-hours: {self.basis}." if known else f"Core-hours are {self.basis}.")
 
 
 def seeds_needed(
@@ -140,13 +130,13 @@ def seeds_needed(
             f"no seed of '{entries[0].label}' reached a threshold within {horizon} steps, so nothing can be simulated "
             "that is slower: train longer, change the task's thresholds, or name another entry first"
         )
-    per_pair, basis = _core_hours(entries, curves, Path(runs))
+    per_pair = _core_hours(entries, horizon // curves[0].steps_per_epoch)
     console = Console(stderr=True, quiet=not progress, highlight=False)
     rows = []
     for title, job in _jobs(entries, curves, draws):
         with console.status(Text(f"simulating: {title}")):
             rows += [_row(title, need, per_pair) for need in job()]
-    return SeedsNeeded(tuple(entries), horizon, tuple(rows), basis, draws)
+    return SeedsNeeded(tuple(entries), horizon, tuple(rows), draws)
 
 
 def _jobs(
@@ -170,27 +160,13 @@ def _jobs(
     return jobs
 
 
-def _core_hours(
-    entries: Sequence[EntryResults], curves: Sequence[LearningCurves], runs: Path
-) -> tuple[float | None, str]:
-    """Return the core-hours of a seed of each of two entries together (None if unknown), and their basis."""
-    speeds = speed.known(runs)
-    total, bases = 0.0, dict[str, list[str]]()
-    for entry, learned in ((entries[0], curves[0]), (entries[-1], curves[-1])):
-        try:
-            estimate = speeds.estimate(EntryStore(entry.folder).entry(), None)
-        except StoreError:  # imported curves, or an entry of another version
-            return None, BASES["unknown"]
-        except UnknownNameError:
-            return None, f"not known without the plugin of {entry.label}"
-        if estimate.seconds is None:
-            return None, BASES["unknown"]
-        total += estimate.seconds * learned.values.shape[1] / 3600
-        within = bases.setdefault(BASES[estimate.basis], [])
-        within += [text for text in [f"{estimate.within:.3g}"] if text not in within]
-    return total, "; ".join(
-        f"{basis}, to within a factor of {' and '.join(within)}" for basis, within in bases.items()
-    )
+def _core_hours(entries: Sequence[EntryResults], epochs: int) -> float | None:
+    """Return the core-hours of a seed of each of two entries together; None where one has curves without times."""
+    each = [
+        epochs * entry.hours / sum(len(run.scores) for run in entry.records.values())
+        for entry in (entries[0], entries[-1])
+    ]
+    return sum(each) if all(each) else None
 
 
 def _row(title: str, need: Need, per_pair: float | None) -> dict[str, Any]:

@@ -157,7 +157,7 @@ def overview(
     """Return the trained and the missing seeds of a study's entries; arguments as for `run_study`."""
     numbers = None if seeds is None else read_seeds(seeds)
     works = study_runner.find_missing(members, runs, where, numbers, epochs)
-    return Overview(study, members, works, study_runner.estimates_of(works), where.workers)
+    return Overview(study, members, works, where.workers)
 
 
 def _outcome(name: str, runs: Path) -> StudyOutcome:

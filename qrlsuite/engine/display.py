@@ -26,8 +26,8 @@ from qrlsuite.results.text import counted, duration
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
 
-SILENCE_SECONDS = 20.0
-"""Seconds of training without a finished epoch before the time of a round is printed."""
+ROUNDS_SECONDS = 20.0
+"""Seconds of a first epoch after which its rounds tell what is left."""
 
 DAY = 86400.0
 
@@ -42,8 +42,9 @@ PHASES = {
 class Clock:
     """Times one group from its progress: its epochs, and the rounds of its first one.
 
-    A process's first epoch is left out, since it includes one-time work (memory that fills up, code that is compiled at
-    its first run).
+    Once two epochs have ended, a process's first epoch is left out, since it includes one-time work (memory that fills
+    up, code that is compiled at its first run). Until then its rounds tell how long an epoch takes at least: learning
+    and validation may follow them.
     """
 
     def __init__(self, epoch: int) -> None:
@@ -52,9 +53,8 @@ class Clock:
         """When the group was started, or first heard of."""
         self.marks: list[tuple[int, float]] = []
         """Epochs, and when they were seen to have ended."""
-        self.round, self.round_began = -1, 0.0
-        self.trains = False
-        """Whether rounds of training are under way; PPO and REINFORCE learn when all of them are done."""
+        self.parts: list[tuple[float, float]] = []
+        """Parts of the first epoch's rounds that were done, and when that was first seen: the first and the last."""
 
     def look(self, state: Mapping[str, Any], now: float) -> None:
         """Take in where the group stands."""
@@ -64,43 +64,54 @@ class Clock:
         epoch, done = int(state.get("epoch") or 0), int(state.get("done") or 0)
         if epoch > (self.marks[-1][0] if self.marks else self.first):
             self.marks.append((epoch, now))
-        trains = state.get("phase") == "training" and done < int(state.get("total") or 0)
-        if (done, trains) != (self.round, self.trains):
-            self.round, self.trains, self.round_began = done, trains, now
+            self.parts = [*self.parts[:1], (1.0, now)]
+        elif not self.marks and state.get("phase") in ("training", "validating"):
+            part = done / max(1, int(state.get("total") or 0)) if state["phase"] == "training" else 1.0
+            if not self.parts or part == 1.0 or part > self.parts[-1][0]:
+                self.parts = [*self.parts[:1], (part, now)]
 
     @property
     def pace(self) -> float | None:
-        """Seconds per epoch, over the later half of the epochs that were timed; None before there are two marks."""
-        if len(self.marks) < 2:
-            return None
+        """Seconds per epoch, over the later half of the epochs that were timed, or by the first rounds; else None."""
+        if not self.settled:
+            (part, began), (last, ended) = (
+                self.parts[:1] + self.parts[-1:] if self.parts else [(0.0, 0.0)] * 2
+            )
+            return (
+                (ended - began) / (last - part) if ended - began >= ROUNDS_SECONDS and last > part else None
+            )
         last, ended = self.marks[-1]
         middle = (self.marks[0][0] + last) // 2
         epoch, began = max(mark for mark in self.marks[:-1] if mark[0] <= max(middle, self.marks[0][0]))
         return (ended - began) / (last - epoch)
 
     @property
+    def settled(self) -> bool:
+        """Whether `pace` is that of epochs."""
+        return len(self.marks) >= 2
+
+    @property
     def once(self) -> float:
         """Seconds of one-time work: the start, and the extra time of the first epoch."""
         if self.begun is None or self.pace is None:
             return 0.0
+        if not self.marks:
+            return self.parts[0][1] - self.begun
         epoch, ended = self.marks[0]
         return max(0.0, ended - self.begun - (epoch - self.first) * self.pace)
-
-    def waited(self, now: float) -> float:
-        """Return for how long the round of training under way has gone on."""
-        return now - self.round_began if self.trains else 0.0
 
     def left(self, epochs: int, now: float) -> float | None:
         """Return the seconds left; an epoch is assumed to take at least as long as the current one so far."""
         if self.pace is None:
             return None
-        epoch, ended = self.marks[-1]
+        part, began = self.parts[0] if self.parts else (0.0, now)
+        epoch, ended = self.marks[-1] if self.marks else (self.first, began - part * self.pace)
         elapsed = now - ended
         return max(0.0, (epochs - epoch) * max(self.pace, elapsed) - elapsed)
 
 
 class CostEstimate:
-    """Estimates the remaining time from whole epochs, from a group's second epoch on."""
+    """Estimates the remaining time: from a group's first rounds, and from whole epochs once two have ended."""
 
     def __init__(self, groups: Sequence[SeedGroup], epochs: int, workers: int) -> None:
         self.groups = {group.id: group for group in groups}
@@ -136,14 +147,10 @@ class CostEstimate:
             longest = max(longest, left)
         return max(total / self.workers, longest)
 
-    def slowest_round(self, now: float) -> float:
-        """Return for how long the longest of the rounds under way has gone on."""
-        return max((clock.waited(now) for clock in self._clocks.values()), default=0.0)
-
     @property
-    def epoch_done(self) -> bool:
-        """Whether an epoch has ended by now."""
-        return any(clock.marks for clock in self._clocks.values())
+    def settled(self) -> bool:
+        """Whether the pace of some group is that of epochs."""
+        return any(clock.settled for clock in self._clocks.values())
 
 
 PROBING = (
@@ -249,11 +256,10 @@ class RunDisplay:
         self.expected: str | None = None
         """The first estimate of the time that is left, as printed."""
         self.endless = False
-        """Whether more than a day is left, by measurement."""
+        """Whether more than a day is left, by the pace of epochs."""
         self.probing = False
         """Whether a group has made a probe, see `qrlsuite.engine.probe`."""
-        self._announced = self._warned = False
-        self._began = time.monotonic()
+        self._announced = self._advised = False
         self._last_line = time.monotonic()
         self._last: dict[str, dict[str, Any]] = {}
 
@@ -314,10 +320,8 @@ class RunDisplay:
             self.probing = True
             self.console.print(PROBING, markup=False, soft_wrap=True)
         left = self.estimate.remaining(snapshot, now)
-        if left is not None and not self._announced:
+        if left is not None:
             self._announce(left)
-        elif now - self._began >= SILENCE_SECONDS and not (self._warned or self.estimate.epoch_done):
-            self._warn(snapshot, now)
         if left is not None and self.deadline is not None:
             left = min(left, max(0.0, self.deadline - now))
         done, completed, epochs = 0.0, 0, []
@@ -354,37 +358,26 @@ class RunDisplay:
         return next((text for phase, text in PHASES.items() if phase in phases), "measuring")
 
     def _announce(self, left: float) -> None:
-        """Print once, after the second epoch, the time that is left."""
+        """Print the time that is left once it is known; advise and sound the alarm once two epochs have ended."""
+        settled = self.estimate.settled
+        if left >= 10 and not self._announced:
+            by = (
+                "about {} left, by the pace since epoch 1"
+                if settled
+                else "{} or more left, by the first rounds"
+            )
+            self.console.print(by.format(duration(left)), soft_wrap=True)
         self._announced = True
-        self.endless |= left > DAY
-        if left >= 10:
-            self.console.print(f"about {duration(left)} left, by the pace since epoch 1", soft_wrap=True)
-        if left > 3600 and not self._warned:
-            self._advise()
+        if settled and not self._advised:
+            self._advised, self.endless = True, left > DAY
+            if left > 3600:
+                self.console.print(f"faster: {self._faster()}", markup=False, soft_wrap=True)
 
-    def _warn(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> None:
-        """Warn once that a round of the first epoch takes long, and name a faster way."""
-        waited = self.estimate.slowest_round(now)
-        rounds = max((int(state.get("total") or 0) for state in snapshot.values()), default=0)
-        if waited < SILENCE_SECONDS / 2:
-            return
-        self._warned = True
-        self.endless = waited * rounds * self.epochs > DAY
-        self.console.print(
-            f"one round of steps and updates of a group takes {duration(waited)} or more, and an epoch has {rounds}",
-            soft_wrap=True,
-        )
-        self._advise()
-
-    def _advise(self) -> None:
-        for advice in self._faster():
-            self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)
-
-    def _faster(self) -> list[str]:
+    def _faster(self) -> str:
         faster = self.entry.model.faster
         if faster in registry.load().names(specs.ModelSpec):
-            return [f"--model {faster} computes the same and trains many times faster"]
-        return ["fewer --seeds or --epochs, or --engine slurm on a cluster; what is trained stays and counts"]
+            return f"--model {faster} computes the same and trains many times faster"
+        return "fewer --seeds or --epochs, or --engine slurm on a cluster; what is trained stays and counts"
 
     def close(self) -> None:
         """Take the live bar away."""

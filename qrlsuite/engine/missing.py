@@ -18,7 +18,7 @@ from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import EngineOutcome, Missing, Snapshot, raise_failures
-from qrlsuite.errors import FileError, OptionError, QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.identity import CodeIdentity
@@ -193,14 +193,11 @@ def expected(work: Missing, where: Where) -> str | None:
     """Say how long training should take, None where this entry was not measured here before."""
     if not work.groups or where.remote or where.device != "cpu":
         return None
-    try:
-        estimate = speed.known(work.runs).estimate(work.entry, work.together)
-    except FileError:  # a plugin's file of reference speeds is malformed, which `qrlsuite check` says
+    measured = speed.measure(work.store, work.together)
+    if measured is None:
         return None
-    if estimate.basis != "measured":
-        return None
-    seconds = estimate.range(work.left / min(where.workers, len(work.groups)))
-    return seconds and f"it should take {duration_range(*seconds)} ({speed.BASES[estimate.basis]})"
+    seconds = measured.range(work.left / min(where.workers, len(work.groups)))
+    return f"it should take {duration_range(*seconds)} ({speed.MEASURED})"
 
 
 def check_memory(work: Missing, where: Where) -> None:

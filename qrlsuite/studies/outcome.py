@@ -14,8 +14,11 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from qrlsuite.engine.sheet import Sheet
-from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.terminal import Shown, command
 from qrlsuite.errors import QrlSuiteError
+from qrlsuite.experiment import identity
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import (
@@ -105,13 +108,12 @@ class StudyOutcome(Shown):
 
     def _hours(self, name: str, seeds: int) -> Hours | None:
         if done := len(self.state.seeds[name]):
-            own = seeds * self.state.hours[name] / done
-            return own, own
-        estimate = speed.known(self.study.folder, self.study.runs).estimate(self.study.entries[name], None)
-        span = estimate.range(abs(seeds) * self.study.epochs)
-        if span is None:
+            hours = seeds * self.state.hours[name] / done
+            return hours, hours
+        own = speed.find(self.study.entries[name], None, self.study.folder, self.study.runs)
+        if own is None:
             return None
-        low, high = (math.copysign(end / 3600, seeds) for end in span)
+        low, high = (math.copysign(end / 3600, seeds) for end in own.range(abs(seeds) * self.study.epochs))
         return low, high
 
     def as_dict(self) -> dict[str, Any]:
@@ -276,11 +278,12 @@ class StudyOutcome(Shown):
         if not self.state.begun:
             most = facts["core_hours_at_most"]
             cost = (
-                "unknown before a first epoch is trained"
-                if most is None
-                else f"{hours_range(*most)} core-hours"
+                f": {hours_range(*most)} core-hours"
+                if most
+                else ", of unknown cost. To measure it, on seeds that no board counts:"
             )
-            yield f"at most {len(self.study.entries) * self.study.design.looks[-1]} seeds: {cost}"
+            yield f"at most {len(self.study.entries) * self.study.design.looks[-1]} seeds{cost}"
+            yield from self._measuring()
             return
         if self.state.ended:
             yield f"ended {self.state.ended}: open pairs stay open"
@@ -295,6 +298,19 @@ class StudyOutcome(Shown):
             f"{facts['protocol_seeds']} seeds: {abs(saved)} {'saved' if saved >= 0 else 'more than that'} on "
             f"entries that are decided{_about(more) if saved else ''}"
         )
+
+    def _measuring(self) -> Iterator[str]:
+        """Return the commands that measure the entries of unknown cost, with as many seeds as the first look."""
+        study = self.study
+        seeds = f"{TUNING_SEEDS}:{TUNING_SEEDS + study.design.looks[0]}"
+        for table, (name, entry) in zip(study.file.entries, study.entries.items()):
+            if self._hours(name, 1) is None:
+                task = str(table.task)
+                alike = resolve(task, entry.label).task.name == entry.task.name
+                words = [entry.label if alike else str(table.model), "--task", task]
+                for source in identity.plugins(entry):
+                    words += ["--plugin", str(source.path)]
+                yield f"  {command('run', *words, '--seeds', seeds, '--epochs', '3', runs=study.runs)}"
 
 
 def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome], list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from qrlsuite.engine.work import Missing
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results import speed
-from qrlsuite.results.speed import BASES, Estimate
+from qrlsuite.results.speed import Speed
 from qrlsuite.results.text import counted, duration_range, hours_range, hours_text
 from qrlsuite.statistics.sequential import Decision
 from qrlsuite.studies.looks import StudyWithLooks
@@ -32,7 +33,7 @@ from qrlsuite.studies.study import Member, Study
 
 @dataclass(frozen=True, repr=False)
 class Overview(Shown):
-    """A table of a study's entries: finished seeds, missing seeds, and their estimated time.
+    """A table of a study's entries: finished seeds, missing seeds, and their time where it was measured.
 
     Attributes
     ----------
@@ -40,8 +41,6 @@ class Overview(Shown):
         The entries in their groups; an entry may be in several.
     works:
         Each entry's seeds, once, in order.
-    estimates:
-        Of a seed's epoch of each entry.
     pairs:
         Numbers of decided pairs, and of pairs that can be tested yet.
     published:
@@ -53,7 +52,6 @@ class Overview(Shown):
     study: Study
     members: Sequence[Member]
     works: Sequence[Missing]
-    estimates: Sequence[Estimate]
     workers: int
     pairs: tuple[int, int] = (0, 0)
     published: Mapping[str, int] | None = None
@@ -62,11 +60,16 @@ class Overview(Shown):
     def now(self, where: Where) -> Overview:
         """Return what is there and what is missing now."""
         works = [find(work.runs, work.entry, where, work.seeds, work.epochs) for work in self.works]
-        return replace(self, works=works, estimates=estimates_of(works))
+        return replace(self, works=works)
+
+    @functools.cached_property
+    def _measured(self) -> list[tuple[Missing, Speed | None]]:
+        """Each entry's seeds, and its speed in this results folder."""
+        return [(work, speed.measure(work.store, work.together)) for work in self.works]
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
-        costs = [_cost(*each) for each in zip(self.works, self.estimates)]
+        costs = [_cost(*each) for each in self._measured]
         known = [cost for cost in costs if cost is not None]
         return {
             **self.study.file.model_dump(
@@ -75,19 +78,19 @@ class Overview(Shown):
             "entries": [
                 self._entry(*each)
                 | ({} if self.published is None else {"published": self.published[each[0].entry.name]})
-                for each in zip(self.works, self.estimates)
+                for each in self._measured
             ],
             "decided": self.pairs[0],
             "pairs": self.pairs[1],
             "workers": self.workers,
             "core_hours_left": sum(known) / 3600,
-            "core_hours_range": [end / 3600 for end in _total(list(zip(self.works, self.estimates)))],
+            "core_hours_range": [end / 3600 for end in _total(self._measured)],
             "hours_left": sum(known) / 3600 / self.workers,
             "complete_estimate": len(known) == len(costs),
             **({"submitted": list(self.submitted)} if self.submitted else {}),
         }
 
-    def _entry(self, work: Missing, estimate: Estimate) -> dict[str, Any]:
+    def _entry(self, work: Missing, measured: Speed | None) -> dict[str, Any]:
         """Return an entry's seeds and their cost as plain values."""
         entry = work.entry
         key = (entry.task.name, entry.name)
@@ -103,10 +106,9 @@ class Overview(Shown):
             "busy": len(work.busy),
             "missing": len(work.todo),
             "epochs": work.epochs,
-            "seconds_per_seed_epoch": estimate.seconds,
-            "basis": estimate.basis,
-            "core_seconds_left": _cost(work, estimate),
-            "core_seconds_range": _range(work, estimate),
+            "seconds_per_seed_epoch": None if measured is None else measured.seconds,
+            "core_seconds_left": _cost(work, measured),
+            "core_seconds_range": _range(work, measured),
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -118,13 +120,11 @@ class Overview(Shown):
         if file.reports:
             yield Text(f"Reported there: {file.reports}")
         yield self._sheet() if self.works else Text("nothing to train")
-        lacking = [each for each in zip(self.works, self.estimates) if each[0].groups]
+        lacking = [each for each in self._measured if each[0].groups]
         if self.works and not lacking:
             yield Text("everything is there")
         elif self.works:
             yield Text(f"left: {_left(lacking, self.workers)}")
-            for basis in dict.fromkeys(estimate.basis for _, estimate in lacking):
-                yield Text(f"  {basis}: {BASES[basis]}")
         if self.pairs[1]:
             yield Text(
                 f"{self.pairs[0]} of {counted(self.pairs[1], 'pair')} decided: of entries with 20 seeds or more, by "
@@ -139,10 +139,10 @@ class Overview(Shown):
 
     def _sheet(self) -> Sheet:
         with_published = ("published",) if self.published is not None else ()
-        heads = ("task", "entry", "seeds", *with_published, "epochs", "core time left", "because")
+        heads = ("task", "entry", "seeds", *with_published, "epochs", "core time left")
         rows = []
-        for work, estimate in zip(self.works, self.estimates):
-            cost, span = _cost(work, estimate), _range(work, estimate)
+        for work, measured in self._measured:
+            cost, span = _cost(work, measured), _range(work, measured)
             busy = f" (+{len(work.busy)} at work)" if work.busy else ""
             cells = (
                 work.entry.task.name,
@@ -151,39 +151,42 @@ class Overview(Shown):
                 *([] if self.published is None else [str(self.published[work.entry.name] or "-")]),
                 str(work.epochs),
                 "-" if cost == 0 else "?" if span is None else duration_range(*span),
-                "" if cost == 0 else estimate.basis,
             )
             rows.append(cells)
-        return Sheet.of("", heads, rows, words=("task", "entry", "core time left", "because"))
+        return Sheet.of("", heads, rows, words=("task", "entry", "core time left"))
 
 
 def _finished(work: Missing) -> int:
     return len(work.seeds) - len(work.todo) - len(work.busy)
 
 
-def _cost(work: Missing, estimate: Estimate) -> float | None:
+def _cost(work: Missing, measured: Speed | None) -> float | None:
     """Return the core-seconds left, None where unknown."""
     if not work.groups:
         return 0.0
-    return None if estimate.seconds is None else work.left * estimate.seconds
+    return None if measured is None else work.left * measured.seconds
 
 
-def _range(work: Missing, estimate: Estimate) -> tuple[float, float] | None:
+def _range(work: Missing, measured: Speed | None) -> tuple[float, float] | None:
     """Return the least and the most core-seconds left, None where unknown."""
-    return estimate.range(work.left) if work.groups else (0.0, 0.0)
+    if not work.groups:
+        return 0.0, 0.0
+    return None if measured is None else measured.range(work.left)
 
 
-def _total(costs: Sequence[tuple[Missing, Estimate]]) -> tuple[float, float]:
+def _total(costs: Sequence[tuple[Missing, Speed | None]]) -> tuple[float, float]:
     """Return the least and the most core-seconds left, of entries with known cost."""
     ranges = [_range(*each) or (0.0, 0.0) for each in costs]
     return sum(low for low, _ in ranges), sum(high for _, high in ranges)
 
 
-def _left(costs: Sequence[tuple[Missing, Estimate]], workers: int) -> str:
+def _left(costs: Sequence[tuple[Missing, Speed | None]], workers: int) -> str:
     """Write the cost of entries: time with a number of workers, core-hours, and the number of unknown costs."""
     low, high = _total(costs)
-    unknown = sum(estimate.seconds is None for _, estimate in costs)
+    unknown = sum(measured is None for _, measured in costs)
     more = f", and {counted(unknown, 'entry')} of unknown cost" if unknown else ""
+    if unknown == len(costs):
+        return f"{counted(unknown, 'entry')} of unknown cost, until a first epoch is trained"
     return (
         f"{duration_range(low / workers, high / workers)} with {counted(workers, 'worker')} "
         f"({hours_range(low / 3600, high / 3600)} core-hours{more})"
@@ -233,12 +236,6 @@ def find_missing(
     """
     unique = {(member.entry.task.name, member.entry.name): member.entry for member in members}
     return [find(runs, entry, where, seeds, epochs) for entry in unique.values()]
-
-
-def estimates_of(works: Sequence[Missing]) -> list[Estimate]:
-    """Return the time that a seed's epoch of each entry should take."""
-    speeds = [speed.known(work.runs) for work in works[:1]]
-    return [speeds[0].estimate(work.entry, work.together) for work in works]
 
 
 def train_missing(

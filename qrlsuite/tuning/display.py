@@ -41,8 +41,7 @@ class TuneDisplay:
 
     def begin(self) -> None:
         """Print the size of each search, and its cost if known."""
-        total: tuple[float, float] | None = (0.0, 0.0)
-        bases: dict[str, None] = {}
+        costs = [self._cost(search) for search in self.searches]
         for search in self.searches:
             request, base = search.request, search.base
             lines = [
@@ -52,27 +51,24 @@ class TuneDisplay:
                 f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
             ]
             self.console.print("\n".join(lines), markup=False)
-            cost, basis = self._cost(search)
-            bases.setdefault(basis)
-            total = None if total is None or cost is None else (total[0] + cost[0], total[1] + cost[1])
-        cores = self.where.workers
-        if total is None or [*bases] != [speed.BASES["measured"]]:
+        cores, known = self.where.workers, [cost for cost in costs if cost is not None]
+        if len(known) < len(costs):
             self.console.print(
                 "what it takes will be known after the first trial; finished trials cost nothing again"
             )
         else:
-            low, high = total
+            low, high = map(sum, zip(*known))
             self.console.print(
                 f"{hours_range(low / 3600, high / 3600)} core-hours, {duration_range(low / cores, high / cores)} with "
-                f"{counted(cores, 'process', 'processes')} ({'; '.join(bases)}); finished trials cost nothing again"
+                f"{counted(cores, 'process', 'processes')} ({speed.MEASURED}); finished trials cost nothing again"
             )
 
-    def _cost(self, search: Search) -> tuple[tuple[float, float] | None, str]:
-        """Return the least and the most core-seconds of a whole search (None if unknown), and their basis."""
+    def _cost(self, search: Search) -> tuple[float, float] | None:
+        """Return the least and the most core-seconds of a whole search; None if unknown."""
         runs = len(search.request.seeds) * (search.beside if self.where.room > 1 else 1)
         together = min(LARGEST_GROUP, math.ceil(runs / self.where.workers))
-        estimate = speed.known(search.runs, search.results).estimate(search.base, together)
-        return estimate.range(search.runs_planned * search.epochs), speed.BASES[estimate.basis]
+        measured = speed.find(search.base, together, search.runs, search.results)
+        return None if measured is None else measured.range(search.runs_planned * search.epochs)
 
     def begin_trials(self, works: Sequence[Missing]) -> None:
         """Show that trials begin; some may have finished before."""

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -348,12 +349,19 @@ def test_a_new_study_takes_the_first_unused_seeds() -> None:
     run()
     assert answer("show", write(study="again.toml"))["looks"]["first_seed"] == 11000
     shown = say("show", "again.toml").stdout
-    assert re.search(r"at most 300 seeds: [\d.]+ to [\d.]+ core-hours", shown), (
-        "as little is known as elsewhere"
-    )
     assert "seeds 11000:11100; any false difference with probability 0.05 (3 pairs, pocock spending)" in shown
     assert "look at 20 seeds: different at p <= 0.0049 while all pairs are open" in shown
     assert "Which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in shown
+
+
+def test_a_new_study_prints_the_commands_that_measure_its_cost() -> None:
+    new = say("study", "new", "new.toml", "mlp width=8", "mlp width=4", "--task", "tiny.toml").stdout
+    assert "at most 200 seeds, of unknown cost. To measure it, on seeds that no board counts:" in new
+    commands = [line for line in new.splitlines() if line.startswith("  qrlsuite run")]
+    assert len(commands) == 2
+    for line in commands:
+        say(*shlex.split(line)[1:])
+    assert re.search(r"at most 200 seeds: [\d.]+( to [\d.]+)? core-hours\n", say("show", "new.toml").stdout)
 
 
 def test_names_of_a_new_study_leave_out_what_all_entries_share() -> None:

@@ -258,17 +258,6 @@ def test_unknown_names() -> None:
         study.parse(SMALL.replace("qubits = [", "qubit = ["), "small.toml").members()
 
 
-def test_speeds_come_with_the_studies() -> None:
-    from qrlsuite.results import speed
-
-    rows = speed.load(Path(str(registry.get(specs.StudySpec, "fig7").speeds)))
-    kinds = {row.kind for row in rows}
-    for name in EXPECTED:
-        for member in study.load(name).members() if name != "matched" else []:
-            entry = member.entry
-            assert (entry.task.environment.name, entry.algorithm.name, entry.model.name) in kinds
-
-
 def test_a_study_with_looks_compares_what_agents_see(tmp_path: Path) -> None:
     """Stacked observations are another task of the same world; paths of another degree are another world."""
     words = ["mlp width=64", "mlp width=64 environment.stack=8"]
