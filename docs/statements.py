@@ -28,7 +28,7 @@ from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoar
 from qrlsuite.statistics.estimator import sample_complexity
 from qrlsuite.statistics.times import times_below
 from qrlsuite.statistics.times_board import holm
-from qrlsuite.studies.outcome import versus
+from qrlsuite.studies.state import versus
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.boards.times import TimeRanking

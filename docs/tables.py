@@ -23,9 +23,9 @@ from qrlsuite import api
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf import published_studies
-from qrlsuite.leaderboard.shelf.published_studies import PublishedStudy
+from qrlsuite.leaderboard.shelf.published import read
 from qrlsuite.results.text import hours_text, interval_text, mean_text, steps_text
-from qrlsuite.studies.outcome import StudyOutcome, by_question, difference_text, versus
+from qrlsuite.studies.state import State, by_question, difference_text, versus
 from qrlsuite.studies.together import StudiesTogether
 from qrlsuite.training.trainer import count_parameters
 
@@ -45,7 +45,7 @@ TABLE = re.compile(r"(?<=<!-- table: )([\w+-]+) (\w+) -->\n\n(?:\|.*\n)*\n*")
 Rows = Iterator[Sequence[str]]
 
 
-def settings(outcome: StudyOutcome) -> Rows:
+def settings(outcome: State) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     tuned = [(str(each.name), each.tuning) for each in outcome.study.file.entries if each.tuning is not None]
     regrets = any(tuning.regret for _, tuning in tuned)
@@ -66,7 +66,7 @@ def settings(outcome: StudyOutcome) -> Rows:
         yield name.removesuffix(", tuned"), parameters, ", ".join(found), trials, *regret, steps
 
 
-def verdicts(outcome: StudyOutcome) -> Rows:
+def verdicts(outcome: State) -> Rows:
     """Every pair below its question."""
     yield "pair A / B", "verdict", "seeds", "B against A", "interval"
     for question, pairs in by_question(outcome.study, outcome.pairs):
@@ -76,14 +76,14 @@ def verdicts(outcome: StudyOutcome) -> Rows:
             yield versus(pair), outcome.verdict(pair), seeds, *difference_text(pair, outcome.study.grid)
 
 
-def entries(outcome: StudyOutcome) -> Rows:
+def entries(outcome: State) -> Rows:
     """Mean times and costs of the entries that a look has reached."""
-    assert isinstance(outcome.study, PublishedStudy)
+    folder = outcome.study.folder
     yield "entry", "seeds", "steps below threshold (95%)", "core-hours", "circuits per seed"
     for entry in outcome.as_dict()["entries"]:
         if entry["mean_time"] is not None:
             took = interval_text(mean_text, entry["mean_time"], *entry["mean_time_interval"])
-            executed = outcome.study.executions(entry["name"])
+            executed = read(folder / outcome.study.task / entry["entry"]).executions.mean()
             circuits = f"{executed / 1e6:.1f} million" if executed else ""
             yield (
                 entry["name"],
@@ -226,7 +226,7 @@ def changes(task: str) -> Rows:
             yield title, label.removeprefix("ddqn "), str(board.n_runs[0]), before, after, said
 
 
-OF_STUDIES: dict[str, Callable[[StudyOutcome], Rows]] = {
+OF_STUDIES: dict[str, Callable[[State], Rows]] = {
     "settings": settings,
     "verdicts": verdicts,
     "entries": entries,
@@ -245,7 +245,7 @@ def _padded(cell: str) -> str:
 
 
 @cache
-def published(name: str) -> StudyOutcome:
+def published(name: str) -> State:
     """Return what a published study has decided."""
     return published_studies.read(published_studies.PUBLISHED / name)
 

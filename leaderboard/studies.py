@@ -22,8 +22,8 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.studies.looks import StudyWithLooks, has_begun
-from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.runner import Overview
+from qrlsuite.studies.state import State
 from qrlsuite.studies.study import EvaluationSection, Member, PictureSection, Study, load
 from qrlsuite.studies.together import StudiesTogether
 
@@ -50,13 +50,12 @@ def find(name: str) -> Study:
     return study
 
 
-def read_outcome(name: str, runs: Path) -> StudyOutcome:
+def read_outcome(name: str, runs: Path) -> State:
     """Return the outcome of a study with looks: of the results folder if it has begun there, else the published one."""
     found, folder = find(name), published_studies.folder_of(name)
     if folder is not None and (folder == Path(name) or not has_begun(runs, found.name)):
         return published_studies.read(folder)
-    study = StudyWithLooks(found, runs)
-    return StudyOutcome(study, study.read())
+    return StudyWithLooks(found, runs).read()
 
 
 def check(study: Study) -> None:

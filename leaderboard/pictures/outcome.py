@@ -14,8 +14,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics.sequential import Decided, PairDecision
-from qrlsuite.studies import outcome as outcomes
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies import state as outcomes
+from qrlsuite.studies.state import State
 from qrlsuite.studies.together import StudiesTogether
 
 if TYPE_CHECKING:
@@ -38,13 +38,13 @@ LOOKS: dict[Decided | None, tuple[str, str, str]] = {
 """Text of the legend, color and marker, by a pair's decision."""
 
 
-def draw(outcome: StudyOutcome) -> Figure:
+def draw(outcome: State) -> Figure:
     """Draw a row for each pair, below the question that it answers.
 
     The axis is B's mean time below threshold over A's, in logarithms: twice as long is as far to the right as half as
     long is to the left. Lines are repeated confidence intervals. Both are cut at a factor of 10.
     """
-    study, decision = outcome.study, outcome.state.decision
+    study, decision = outcome.study, outcome.decision
     if not any(pair.p for pair in decision.pairs):
         raise OptionError(f"{study.name} has taken no look yet: there is nothing to draw")
     groups = outcomes.by_question(study, decision.pairs)
@@ -81,7 +81,7 @@ def draw(outcome: StudyOutcome) -> Figure:
     return figure
 
 
-def draw_entries(outcome: StudyOutcome) -> Figure:
+def draw_entries(outcome: State) -> Figure:
     """Draw each entry that a look has reached by its mean time below threshold M, the shortest first.
 
     An entry called `X, tuned` shares the row of the entry X.

@@ -11,8 +11,8 @@ from typing import Any
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import p_text
-from qrlsuite.studies.outcome import (
-    StudyOutcome,
+from qrlsuite.studies.state import (
+    State,
     difference_text,
     horizon_note,
     needs_text,
@@ -89,7 +89,7 @@ class StudyView:
     picture: LooksPicture
 
 
-def view(outcome: StudyOutcome) -> StudyView:
+def view(outcome: State) -> StudyView:
     """Return a study with its decisions for the template."""
     study = outcome.study
     plain = outcome.as_dict()
@@ -117,9 +117,9 @@ def view(outcome: StudyOutcome) -> StudyView:
     )
 
 
-def _facts(outcome: StudyOutcome, plain: dict[str, Any]) -> list[tuple[str, str]]:
+def _facts(outcome: State, plain: dict[str, Any]) -> list[tuple[str, str]]:
     study = outcome.study
-    entry, looks, ended = next(iter(study.entries.values())), study.looks, outcome.state.ended
+    entry, looks, ended = next(iter(study.entries.values())), study.looks, outcome.ended
     steps = study.epochs * entry.task.file.protocol.interactions
     saved, used = plain["seeds_saved"], sum(each["seeds"] for each in plain["entries"])
     if ended:
@@ -127,7 +127,7 @@ def _facts(outcome: StudyOutcome, plain: dict[str, Any]) -> list[tuple[str, str]
     elif outcome.finished:
         state = "finished"
     else:
-        state = f"goes on: next look at {max(outcome.state.decision.wanted.values())} seeds"
+        state = f"goes on: next look at {max(outcome.decision.wanted.values())} seeds"
     return [
         ("State", state),
         ("Task", f"{entry.task.name}, {steps} environment steps"),
@@ -136,7 +136,7 @@ def _facts(outcome: StudyOutcome, plain: dict[str, Any]) -> list[tuple[str, str]
             if looks.written
             else []
         ),
-        *([("First seed begun", _minute(outcome.state.begun_at))] if outcome.state.begun_at else []),
+        *([("First seed begun", _minute(outcome.begun_at))] if outcome.begun_at else []),
         ("Hash of the study", study.hash),
         (
             "Seeds",
@@ -147,8 +147,8 @@ def _facts(outcome: StudyOutcome, plain: dict[str, Any]) -> list[tuple[str, str]
     ]
 
 
-def _look(outcome: StudyOutcome, index: int) -> LookLine:
-    design, taken = outcome.study.design, outcome.state.taken
+def _look(outcome: State, index: int) -> LookLine:
+    design, taken = outcome.study.design, outcome.taken
     seeds = design.looks[index]
     spent = 2 * design.spending.spent([seeds / design.looks[-1]], design.alpha / 2)[0]
     cells = []
@@ -165,7 +165,7 @@ def _look(outcome: StudyOutcome, index: int) -> LookLine:
     )
 
 
-def _picture(outcome: StudyOutcome) -> LooksPicture:
+def _picture(outcome: State) -> LooksPicture:
     design = outcome.study.design
     looks = range(len(design.looks))
     strict = [design.level(look, len(design.family)) for look in looks]

@@ -19,7 +19,7 @@ from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.state import State
 
 PAPER = "https://arxiv.org/abs/2501.15893"
 SCRIPTS = ("page.js", "curves.js", "picked.js")
@@ -30,7 +30,7 @@ LONGEST_REASON = 600
 def render(
     board: Leaderboard,
     title: str = "Leaderboard",
-    studies: Sequence[StudyOutcome] = (),
+    studies: Sequence[State] = (),
     beside: Leaderboard | None = None,
     live: bool = False,
 ) -> str:

@@ -10,7 +10,6 @@ Verdicts are not stored: they are computed from the study and the curves.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,58 +18,13 @@ from qrlsuite.leaderboard.shelf import PLANS, collect, import_seeds, published
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.export import export as export_entry
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
-from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results.store import EntryStore, write_atomically
-from qrlsuite.studies.looks import FILE, LOG, Run, StudyWithLooks
-from qrlsuite.studies.outcome import StudyOutcome, in_folder
+from qrlsuite.studies.looks import FILE, LOG, Curves, StudyWithLooks, in_folder
+from qrlsuite.studies.state import State
 from qrlsuite.studies.study import Study, dumps, load_kept
 
 PUBLISHED = PLANS
 """The studies with looks that come with the suite."""
-
-
-class PublishedStudy(StudyWithLooks):
-    """A published study with its results.
-
-    Parameters
-    ----------
-    folder:
-        The one that `export` wrote.
-    labels:
-        Check the labels of its entries, see `published.read`.
-    """
-
-    def __init__(self, folder: Path, labels: bool = True) -> None:
-        super().__init__(load(folder), folder.parent)
-        self.folder = folder
-        self._published: dict[str, PublishedEntry] = {}
-        for name, entry in self.entries.items():
-            path = folder / entry.task.name / entry.name
-            if path.is_dir():
-                self._published[name] = read = published.read(path, labels)
-                if read.record.hash != entry.hash:
-                    raise StoreError(f"{path} is not the study's entry '{entry.label}' ({entry.hash})")
-                if (length := read.curves.shape[1]) < self.epochs:
-                    raise StoreError(f"{path} has {length} epochs, and its study {self.epochs}")
-
-    @property
-    def begun(self) -> bool:
-        """A published study has begun."""
-        return True
-
-    def check(self) -> bool:
-        """Return True: the published file is the study as it was when its first seed began."""
-        return True
-
-    def runs_of(self, name: str) -> Iterator[Run]:
-        """Yield the seeds of an entry."""
-        if (each := self._published.get(name)) is not None:
-            for seed, curve, hours in zip(each.seeds, each.curves, each.hours):
-                yield Run(seed, each.record.plan, curve[: self.epochs], float(hours))
-
-    def executions(self, name: str) -> float:
-        """Return the circuit executions of an entry's seeds, mean per seed; 0 where it has none."""
-        return float(self._published[name].executions.mean()) if name in self._published else 0.0
 
 
 def names() -> list[str]:
@@ -95,17 +49,40 @@ def is_published(path: Path) -> bool:
     return (path / FILE).is_file()
 
 
-def read(folder: Path, labels: bool = True) -> StudyOutcome:
-    """Return the outcome of a published study; parameters as for `PublishedStudy`."""
+def read(folder: Path, labels: bool = True) -> State:
+    """Return the state of a published study.
+
+    Parameters
+    ----------
+    folder:
+        The one that `export` wrote.
+    labels:
+        Check the labels of its entries, see `published.read`.
+    """
     if not is_published(folder):
         raise StoreError(
             f"{folder} holds no {FILE}: give a study's file, or a folder that `qrlsuite export` wrote"
         )
-    study = PublishedStudy(folder, labels)
-    return StudyOutcome(study, study.read())
+    study = StudyWithLooks(load(folder), folder.parent)
+    study.folder = folder
+    trained, hours = dict[str, Curves](), dict[str, float]()
+    for name, entry in study.entries.items():
+        path = folder / entry.task.name / entry.name
+        trained[name], hours[name] = {}, 0.0
+        if not path.is_dir():
+            continue
+        found = published.read(path, labels)
+        if found.record.hash != entry.hash:
+            raise StoreError(f"{path} is not the study's entry '{entry.label}' ({entry.hash})")
+        if (length := found.curves.shape[1]) < study.epochs:
+            raise StoreError(f"{path} has {length} epochs, and its study {study.epochs}")
+        for seed in found.seeds:
+            study.require_own(name, seed, found.record.plan)
+        trained[name], hours[name] = dict(zip(found.seeds, found.curves)), float(sum(found.hours))
+    return study.state(trained, hours, begun=True)
 
 
-def collected(selection: Selection) -> tuple[list[StudyOutcome], list[str]]:
+def collected(selection: Selection) -> tuple[list[State], list[str]]:
     """Return the outcomes of the selection's studies with looks, and a line for each unreadable study.
 
     A study in both the results folder and the suite is read from the folder.
@@ -153,7 +130,7 @@ def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
 
 def import_study(folder: Path, runs: Path) -> list[Imported]:
     """Copy the seeds of a published study to a results folder, where `study run` goes on with it."""
-    source = PublishedStudy(folder)
+    source = read(folder).study
     study = StudyWithLooks(load(folder), runs)
     study.begin()
     done = [

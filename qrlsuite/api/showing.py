@@ -26,8 +26,8 @@ from qrlsuite.results.store import EntryStore, entries, write_atomically
 from qrlsuite.results.survey import outline
 
 if TYPE_CHECKING:
-    from qrlsuite.studies.outcome import StudyOutcome
     from qrlsuite.studies.runner import Overview
+    from qrlsuite.studies.state import State
     from qrlsuite.studies.together import StudiesTogether
 
 PICTURE = "picture"
@@ -44,7 +44,7 @@ def describe(
     format: str | None = None,
     runs: str | PathLike[str] = "runs",
     published: bool = False,
-) -> dict[str, Any] | Overview | StudyOutcome | StudiesTogether:
+) -> dict[str, Any] | Overview | State | StudiesTogether:
     """Describe a registered thing, a picture, an entry or a study.
 
     Parameters
@@ -65,7 +65,7 @@ def describe(
 
     Returns
     -------
-    dict or Overview or StudyOutcome or StudiesTogether
+    dict or Overview or State or StudiesTogether
         For a study the result of `read_study`.
 
     Raises

@@ -30,8 +30,8 @@ from qrlsuite.studies import looks as with_looks
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
 from qrlsuite.studies.looks import StudyWithLooks
-from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.runner import Overview
+from qrlsuite.studies.state import State
 from qrlsuite.studies.study import Member, Study
 from qrlsuite.studies.together import StudiesTogether
 
@@ -52,7 +52,7 @@ def new_study(
     first_seed: int | None = None,
     reason: str = "",
     runs: str | PathLike[str] = "runs",
-) -> StudyOutcome:
+) -> State:
     """Write a study with looks, which compares entries with as many seeds as it takes. Trains nothing.
 
     Parameters
@@ -98,7 +98,7 @@ def new_study(
         margin=margin,
         reason=reason,
     )
-    outcome = StudyOutcome(study, study.read())
+    outcome = study.read()
     write_atomically(file, (_plugins_of(study, file) + study_files.dumps(study.file)).encode())
     return outcome
 
@@ -112,7 +112,7 @@ def _plugins_of(study: StudyWithLooks, file: Path) -> str:
 
 def read_study(
     name: str, *more: str, runs: str | PathLike[str] = "runs", published: bool = False
-) -> Overview | StudyOutcome | StudiesTogether:
+) -> Overview | State | StudiesTogether:
     """Read a study's progress: its trained and missing seeds, or the decisions of its looks. Trains nothing.
 
     Parameters
@@ -160,7 +160,7 @@ def overview(
     return Overview(study, members, works, where.workers)
 
 
-def _outcome(name: str, runs: Path) -> StudyOutcome:
+def _outcome(name: str, runs: Path) -> State:
     """Read a study that must have looks."""
     if studies.find(name).file.looks is None:
         raise OptionError(f"study '{name}' has no looks: only studies with looks are read together")
@@ -183,7 +183,7 @@ def run_study(
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
-) -> Overview | StudyOutcome:
+) -> Overview | State:
     """Train a study's missing seeds, the entry that lacks least first.
 
     Entries and their folders are those of `train`: nothing is trained twice. A study with looks has seeds of its own,
@@ -208,7 +208,7 @@ def run_study(
 
     Returns
     -------
-    Overview, or StudyOutcome of a study with looks
+    Overview, or State of a study with looks
         The entries with their trained and missing seeds; `submitted`; and `as_dict()`. With looks: `pairs`, each with
         its `verdict`, `difference` (the second's mean time below threshold over the first's, minus 1), `interval`, `p`
         and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
@@ -306,7 +306,7 @@ def end_study(name: str, *, runs: str | PathLike[str] = "runs") -> None:
 
 def take_looks(
     study: Study, where: Where, budget: str | None, runs: str | PathLike[str], progress: bool
-) -> StudyOutcome:
+) -> State:
     """Train a study with looks until all pairs are decided; print the decisions of every look."""
     missing.check_budget(budget, where)
     return study_runner.take_looks(StudyWithLooks(study, Path(runs)), where, budget, not progress)

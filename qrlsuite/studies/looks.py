@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import datetime
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ import pydantic
 from numpy.typing import NDArray
 
 from qrlsuite import files, notation, options
-from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
@@ -37,6 +37,7 @@ from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, json_line, read_records, write_atomically
 from qrlsuite.statistics import Grid, LearningCurves, SequentialDesign, decide
 from qrlsuite.statistics.sequential import Decision
+from qrlsuite.studies.state import State
 from qrlsuite.studies.study import (
     EntriesSection,
     LooksSection,
@@ -50,63 +51,13 @@ from qrlsuite.studies.study import (
 )
 from qrlsuite.tuning.search import FOLDER as TUNING
 
+Curves = Mapping[int, NDArray[np.float64]]
+"""Learning curves of finished seeds by seed, of shape (T,) or longer."""
 FOLDER = "decisions"
 """Below the results folder: studies with looks have a folder each, so that leaderboards do not rank their seeds."""
 FILE, LOG = "plan.toml", "looks.jsonl"
 LONG = 40
 """Characters of a name beyond which a new study leaves out the common part of its names."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """A seed of a study.
-
-    Attributes
-    ----------
-    plan:
-        Hash of the study that trains it; None where it is of none.
-    curve:
-        Shape (T,); None where it has not reached the study's last epoch.
-    """
-
-    seed: int
-    plan: str | None
-    curve: NDArray[np.float64] | None
-    hours: float
-
-
-@dataclass(frozen=True, eq=False)
-class StudyState:
-    """The content of a study's folder when it was read, and the decisions.
-
-    Attributes
-    ----------
-    begun_at, ended:
-        When the first seed was begun, and when the study was ended before all was decided, by its log.
-    taken:
-        When each look was taken, by its number of seeds.
-    seeds:
-        Finished seeds of each entry, from the block's first on without a gap.
-    curves:
-        Their learning curves; entries without any are absent.
-    hours:
-        Core-hours of each entry, with its unfinished seeds.
-    """
-
-    begun: bool
-    begun_at: str | None
-    ended: str | None
-    taken: Mapping[int, str]
-    seeds: Mapping[str, Sequence[int]]
-    curves: Mapping[str, LearningCurves]
-    hours: Mapping[str, float]
-    decision: Decision
-
-    @property
-    def missing(self) -> dict[str, int]:
-        """How many seeds each open entry lacks for the next look; none where it has them."""
-        lacking = {name: count - len(self.seeds[name]) for name, count in self.decision.wanted.items()}
-        return {name: count for name, count in lacking.items() if count > 0}
 
 
 class StudyWithLooks:
@@ -287,41 +238,48 @@ class StudyWithLooks:
             raise OptionError(f"{self.source}: every pair is closed, so there is nothing to end")
         append(self.folder / LOG, json_line({"ended": _now()}))
 
-    def runs_of(self, name: str) -> Iterator[Run]:
-        """Yield the seeds of an entry that were begun."""
-        store = EntryStore.find(self.folder, self.entries[name])
-        for seed in store.seeds() if store.path.is_dir() else []:
-            folder = store.seed(seed)
-            record = folder.record()
-            if record is not None and record.finished and record.epochs >= self.epochs:
-                run = folder.read()
-                yield Run(seed, record.plan, run.curve[: self.epochs], run.seconds / 3600)
-            else:
-                yield Run(seed, self.hash if record is None else record.plan, None, folder.seconds() / 3600)
-
-    def read(self) -> StudyState:
+    def read(self) -> State:
         """Read the folder once, and decide by it; writes nothing."""
-        begun, log = self.check(), self._log()
-        seeds, curves, hours = dict[str, list[int]](), dict[str, LearningCurves](), dict[str, float]()
+        begun, trained, hours = self.check(), dict[str, Curves](), dict[str, float]()
         for name, entry in self.entries.items():
-            runs = list(self.runs_of(name))
-            for run in runs:
-                if run.seed in self.looks.block and run.plan != self.hash:
-                    raise StoreError(
-                        f"{EntryStore.find(self.folder, entry).seed(run.seed).path}: seed {run.seed} of '{name}' was "
-                        f"not trained by study {self.hash}; delete that folder, and the study trains it"
-                    )
-            done = {run.seed: run.curve for run in runs if run.curve is not None}
+            store, curves = EntryStore.find(self.folder, entry), dict[int, NDArray[np.float64]]()
+            trained[name], hours[name] = curves, 0.0
+            for seed in store.seeds() if store.path.is_dir() else []:
+                folder, record = store.seed(seed), store.seed(seed).record()
+                if record is not None:
+                    self.require_own(name, seed, record.plan)
+                if record is not None and record.finished and record.epochs >= self.epochs:
+                    run = folder.read()
+                    curves[seed] = run.curve
+                    hours[name] += run.seconds / 3600
+                else:
+                    hours[name] += folder.seconds() / 3600
+        return self.state(trained, hours, begun)
+
+    def require_own(self, name: str, seed: int, plan: str | None) -> None:
+        """Refuse a seed of the block that another study, or none, has trained."""
+        if seed in self.looks.block and plan != self.hash:
+            path = EntryStore.find(self.folder, self.entries[name]).seed(seed).path
+            raise StoreError(
+                f"{path}: seed {seed} of '{name}' was not trained by study {self.hash}; delete that folder, and the "
+                "study trains it"
+            )
+
+    def state(self, trained: Mapping[str, Curves], hours: Mapping[str, float], begun: bool) -> State:
+        """Decide by the curves of finished seeds, and compare with the log of looks."""
+        log, seeds, curves = self._log(), dict[str, range](), dict[str, LearningCurves]()
+        for name, done in trained.items():
             gap = next((seed for seed in self.looks.block if seed not in done), self.looks.block.stop)
-            seeds[name] = list(range(self.looks.block.start, gap))
-            hours[name] = sum(run.hours for run in runs)
+            seeds[name] = range(self.looks.block.start, gap)
             if seeds[name]:
-                values = np.stack([done[seed] for seed in seeds[name]])
-                curves[name] = LearningCurves(values, entry.task.file.protocol.interactions, name)
+                values = np.stack([done[seed][: self.epochs] for seed in seeds[name]])
+                steps = self.entries[name].task.file.protocol.interactions
+                curves[name] = LearningCurves(values, steps, name)
         decision = decide(self.design, curves, self.grid)
         self._compare(decision, log)
-        return StudyState(
-            begun=begun,
+        return State(
+            self,
+            begun,
             begun_at=self._begun_at(log),
             ended=next((line.ended for line in log if line.ended), None),
             taken=dict(sorted({line.look: line.time or "" for line in reversed(log) if line.look}.items())),
@@ -349,7 +307,7 @@ class StudyWithLooks:
     def _begun_at(self, log: Sequence[LookLine]) -> str | None:
         return next((line.begun for line in log if line.begun and line.plan == self.hash), None)
 
-    def look(self) -> StudyState:
+    def look(self) -> State:
         """Take every look for which the seeds are there, and note when."""
         state = self.read()
         taken = dict(state.taken)
@@ -359,6 +317,25 @@ class StudyWithLooks:
                 content = {"time": taken[line.look], "plan": self.hash, **line.content}
                 append(self.folder / LOG, json_line(content))
         return replace(state, taken=taken)
+
+
+def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[State], list[str]]:
+    """Return the outcomes of the studies that have begun in a results folder, and a line for each unreadable study.
+
+    Parameters
+    ----------
+    tasks:
+        Only studies of these tasks; all where empty.
+    """
+    outcomes, refused = [], []
+    for path in sorted((runs / FOLDER).glob(f"*/{FILE}")):
+        try:
+            study = StudyWithLooks(load_kept(path), runs)
+            if study.begun and (not tasks or study.task in tasks):
+                outcomes.append(study.read())
+        except QrlSuiteError as error:
+            refused.append(str(error))
+    return outcomes, refused
 
 
 def has_begun(runs: Path, name: str) -> bool:

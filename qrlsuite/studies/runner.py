@@ -27,7 +27,7 @@ from qrlsuite.results.speed import Speed
 from qrlsuite.results.text import counted, duration_range, hours_range, hours_text
 from qrlsuite.statistics.sequential import Decision
 from qrlsuite.studies.looks import StudyWithLooks
-from qrlsuite.studies.outcome import StudyOutcome, versus
+from qrlsuite.studies.state import State, versus
 from qrlsuite.studies.study import Member, Study
 
 
@@ -262,7 +262,7 @@ def train_missing(
     return tuple(submitted)
 
 
-def take_looks(study: StudyWithLooks, where: Where, budget: str | None, quiet: bool) -> StudyOutcome:
+def take_looks(study: StudyWithLooks, where: Where, budget: str | None, quiet: bool) -> State:
     """Train the seeds of each look and take it, until every pair is closed, or others have the seeds.
 
     Unless it is quiet, it prints the decisions of every look.
@@ -279,7 +279,7 @@ def take_looks(study: StudyWithLooks, where: Where, budget: str | None, quiet: b
         if state.missing and state.decision.wanted == wanted:
             break  # a queue or another process has the seeds, or the budget is used up
         _say_look(state.decision, Console(stderr=True, quiet=quiet, highlight=False))
-    return StudyOutcome(study, state, submitted)
+    return replace(state, submitted=submitted)
 
 
 def _say_look(decision: Decision, console: Console) -> None:

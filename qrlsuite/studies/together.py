@@ -22,7 +22,7 @@ from qrlsuite.results.text import interval_text, p_text, percent
 from qrlsuite.statistics import MeanRatio, mean_ratio, times_below
 from qrlsuite.statistics.grid import IntArray
 from qrlsuite.statistics.times_board import holm
-from qrlsuite.studies.outcome import StudyOutcome, by_question
+from qrlsuite.studies.state import State, by_question
 
 ALPHA = 0.05
 """Probability of any false difference, over all pairs."""
@@ -63,7 +63,7 @@ class StudiesTogether(Shown):
     Entries of one name may have other options on another task: for example, options that were tuned for it.
     """
 
-    studies: tuple[StudyOutcome, ...]
+    studies: tuple[State, ...]
 
     def __post_init__(self) -> None:
         if len(self.studies) < 2:
@@ -99,10 +99,10 @@ class StudiesTogether(Shown):
         return tuple(each.study.design.looks[0] for each in self.studies)
 
     @staticmethod
-    def _lacking(outcome: StudyOutcome) -> Iterator[str]:
+    def _lacking(outcome: State) -> Iterator[str]:
         """Yield the entries that lack seeds of the first look."""
         for name in outcome.study.entries:
-            curves = outcome.state.curves.get(name)
+            curves = outcome.curves.get(name)
             if curves is None or len(curves.values) < outcome.study.design.looks[0]:
                 yield name
 
@@ -118,9 +118,9 @@ class StudiesTogether(Shown):
             if all(frozenset((pair.first, pair.second)) in family for family in have)
         ]
 
-    def _times(self, outcome: StudyOutcome, name: str) -> IntArray:
+    def _times(self, outcome: State, name: str) -> IntArray:
         """Return an entry's times below each threshold at the first look, (N, E)."""
-        curves = outcome.state.curves[name]
+        curves = outcome.curves[name]
         seeds = outcome.study.design.looks[0]
         return times_below(curves.values[:seeds], outcome.study.grid, curves.steps_per_epoch)
 
@@ -222,7 +222,7 @@ class StudiesTogether(Shown):
         return Sheet.of("", heads, rows, words=heads[:2])
 
 
-def _configuration(outcome: StudyOutcome, name: str) -> str:
+def _configuration(outcome: State, name: str) -> str:
     """Return an entry's algorithm and model with all their options as text, whatever the task."""
     identity = outcome.study.entries[name].identity
     return repr([identity.get(key) for key in ("algorithm", "algorithm_options", "model", "model_options")])

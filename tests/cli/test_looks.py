@@ -33,7 +33,7 @@ from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
-from qrlsuite.studies.outcome import needs_text
+from qrlsuite.studies.state import needs_text
 from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, cases, results
 
@@ -252,8 +252,8 @@ def test_python_compares_as_the_command_does() -> None:
     assert not Path("runs").exists()
     found = api.run_study("widths.toml", engine="scripted", progress=False)
     read = api.read_study("widths.toml")
-    assert isinstance(found, studies.StudyOutcome)
-    assert isinstance(read, studies.StudyOutcome)
+    assert isinstance(found, studies.State)
+    assert isinstance(read, studies.State)
     assert found.finished
     assert found.pairs == read.pairs
     assert json.loads(json.dumps(found.as_dict())) == answer("show", "widths.toml")
@@ -574,8 +574,8 @@ def test_pictures_have_a_row_for_each_pair_and_each_entry(refused: Refused) -> N
         replace(first, interval=(-1.0, math.inf)),
         replace(second, difference=math.nan, interval=(-1.0, math.inf)),
     )
-    decision = replace(outcome.state.decision, pairs=unbounded)
-    figure = drawing.draw(replace(outcome, state=replace(outcome.state, decision=decision)))
+    decision = replace(outcome.decision, pairs=unbounded)
+    figure = drawing.draw(replace(outcome, decision=decision))
     [axes] = figure.axes
     assert next(list(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2) == [0.1, 10]
     assert {text.get_text() for text in axes.texts} == {"20", "both mean times are 0"}
@@ -662,7 +662,7 @@ def test_a_published_study_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(("seeds", "said"), [(157, "about 157 if the"), (601, "over 600 if the")])
 def test_far_more_seeds_than_the_last_look_are_not_counted(seeds: int, said: str) -> None:
     study = SimpleNamespace(design=SimpleNamespace(looks=(20, 40, 60)))
-    outcome: Any = SimpleNamespace(study=study, state=SimpleNamespace(ended=None))
+    outcome: Any = SimpleNamespace(study=study, ended=None)
     needs = {"level": 0.0021, "seeds": 40, "seeds_at_this_difference": seeds}
     assert needs_text(outcome, needs) == f"p <= 0.0021 at 40 seeds; {said} difference stays as it is now"
 

@@ -13,7 +13,7 @@ import pytest
 from qrlsuite import api
 from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.statistics.sequential import Decided
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.state import State
 from qrlsuite.studies.together import StudiesTogether
 from tests.commands import answer, say
 
@@ -37,7 +37,7 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks()
         logs = []
         for each in outcomes:
             first, second = (
-                np.mean([each.state.curves[pair[side]].values[:20] < t for t in each.study.grid.thresholds])
+                np.mean([each.curves[pair[side]].values[:20] < t for t in each.study.grid.thresholds])
                 for side in ("first", "second")
             )  # of all epochs: a pair that went on counts with its first look, too
             logs.append(math.log(second / first))
@@ -97,7 +97,7 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
 
 def test_a_pair_without_a_ratio_is_left_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     outcomes = [api.read_study(name) for name in TOGETHER[1:]]
-    assert all(isinstance(each, StudyOutcome) for each in outcomes)
+    assert all(isinstance(each, State) for each in outcomes)
     read = StudiesTogether(tuple(outcomes))  # type: ignore[arg-type]
     times = StudiesTogether._times
 

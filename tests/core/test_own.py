@@ -19,8 +19,7 @@ from qrlsuite.results import probes
 from qrlsuite.results.records import EntryRecord, ProbeRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
-from qrlsuite.studies.looks import FILE, FOLDER
-from qrlsuite.studies.outcome import in_folder
+from qrlsuite.studies.looks import FILE, FOLDER, in_folder
 from qrlsuite.training.trainer import Trainer, first_network
 from tests.conftest import cases
 

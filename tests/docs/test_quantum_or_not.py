@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.store import read_lines
 from qrlsuite.studies.looks import FILE, LOG, StudyWithLooks
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.state import State
 from qrlsuite.studies.study import load as load_study
 from tests.conftest import cases
 from tests.docs import load, percent
@@ -71,7 +71,7 @@ def test_hash_permutations_and_next_look_are_those_of_the_log(name: str, tmp_pat
             assert p[tuple(pair["pair"])][index] == pair["p"]
     every = outcome.study.design.looks
     expected = set() if outcome.finished else {every[len(looks)]}
-    assert set(outcome.state.decision.wanted.values()) == expected
+    assert set(outcome.decision.wanted.values()) == expected
     own = StudyWithLooks(published_studies.load(published_studies.PUBLISHED / name), tmp_path)
     own.begin()
     assert StudyWithLooks(load_study(str(own.folder / FILE)), tmp_path).hash == outcome.study.hash
@@ -278,9 +278,9 @@ def test_ten_qubits() -> None:
     assert said.format(tunings[circuit].trials, tunings["10 qubits mean-field"].trials) in PROSE
     assert tunings[circuit].note.endswith("trials trained on NVIDIA H200")
 
-    def times(name: str, study: StudyOutcome) -> NDArray[np.float64]:
+    def times(name: str, study: State) -> NDArray[np.float64]:
         """Steps below each threshold in 30 epochs, mean over seeds."""
-        curves = study.state.curves[name].values[:, :30, None]
+        curves = study.curves[name].values[:, :30, None]
         return 2000 * (curves < np.array(outcome.study.grid.thresholds)).sum(axis=1).mean(axis=0)
 
     hand, ours = times("width 14", tables.published("larger-batch")), times(circuit, outcome)
@@ -288,11 +288,11 @@ def test_ten_qubits() -> None:
     assert f"needed {hand.mean() / 1000:.1f}k in 30 epochs" in PROSE
     assert "these settings need {} more (16% to 44%), and {} more to reach 0.9".format(*more) in PROSE
     assert f"with settings that were set by hand, we saw {more[1]} afterwards" in README
-    first = outcome.state.curves[circuit].values[:20]
+    first = outcome.curves[circuit].values[:20]
     thresholds = np.array(outcome.study.grid.thresholds)
     below = [
         (curves[:, :, None] < thresholds).sum(axis=(0, 1))
-        for curves in (outcome.state.curves["sines 14"].values, first)
+        for curves in (outcome.curves["sines 14"].values, first)
     ]
     low = (below[0] / below[1] - 1)[thresholds <= 0.7]
     assert f"they needed {percent(min(low))} to {percent(max(low))} more on the same 20 seeds" in PROSE
@@ -304,7 +304,7 @@ def test_seeds_that_learned_and_hours_are_those_of_the_studies() -> None:
     assert f"| {hours:.2f} for three claims |" in CLAIMS
     learned = {
         name: (int((np.max(curves.values, axis=1) >= 0.6).sum()), len(curves.values))
-        for name, curves in both[0].state.curves.items()
+        for name, curves in both[0].curves.items()
     }
     assert learned["hsiao, ring of CNOTs"] == (0, 40)
     assert learned["hsiao"] == (17, 40)

@@ -17,8 +17,7 @@ from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
-from qrlsuite.studies.looks import StudyWithLooks, new
-from qrlsuite.studies.outcome import in_folder
+from qrlsuite.studies.looks import StudyWithLooks, in_folder, new
 from tests.commands import say
 from tests.conftest import TINY
 from tests.leaderboard import boards

@@ -32,7 +32,7 @@ from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
 from qrlsuite.notation import parse_named
 from qrlsuite.results.text import counted
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.state import State
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -186,7 +186,7 @@ def _changes(words: list[str] | None) -> tuple[dict[str, Any], dict[str, str], l
     return settings, models, only
 
 
-def _report(name: str, outcome: StudyOutcome, budget: str | None, runs: Path, json_output: bool) -> None:
+def _report(name: str, outcome: State, budget: str | None, runs: Path, json_output: bool) -> None:
     """Print the outcome of a study with looks, and the next command."""
     if json_output:
         typer.echo(json.dumps(outcome.as_dict()))
@@ -194,7 +194,7 @@ def _report(name: str, outcome: StudyOutcome, budget: str | None, runs: Path, js
     for line in outcome.submitted:
         typer.echo(line)
     table_console().print(outcome, soft_wrap=True)
-    if missing := outcome.state.missing:
+    if missing := outcome.missing:
         lacking = ", ".join(f"{counted(count, 'seed')} of {name}" for name, count in missing.items())
         who = "others train" if budget is None else "the budget is used up, or others train"
         typer.echo(f"{who} {lacking}: repeat this command when they have finished")

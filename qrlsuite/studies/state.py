@@ -1,4 +1,4 @@
-"""The outcome of a study with looks, for a screen, a page, and as plain values."""
+"""The state of a study with looks, for a screen, a page, and as plain values."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown, command
-from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS
@@ -30,13 +28,14 @@ from qrlsuite.results.text import (
     p_text,
     percent,
 )
+from qrlsuite.statistics import LearningCurves
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.planning import runs_at_difference
-from qrlsuite.statistics.sequential import Decided, PairDecision
+from qrlsuite.statistics.sequential import Decided, Decision, PairDecision
 from qrlsuite.statistics.times import MeanTime, mean_time
-from qrlsuite.studies import looks
-from qrlsuite.studies.looks import StudyState, StudyWithLooks
-from qrlsuite.studies.study import load_kept
+
+if TYPE_CHECKING:
+    from qrlsuite.studies.looks import StudyWithLooks
 
 Pair = TypeVar("Pair")
 """A pair's decision, or more facts on it."""
@@ -49,30 +48,53 @@ Hours = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StudyOutcome(Shown):
-    """A study with looks and its decisions so far.
+class State(Shown):
+    """What of a study with looks is trained, and what is decided.
 
     Attributes
     ----------
-    state:
-        Content of its folder; `decision` has every pair with its verdict, p at each look, difference and interval.
+    begun_at, ended:
+        When the first seed was begun, and when the study was ended before all was decided, by its log.
+    taken:
+        When each look was taken, by its number of seeds.
+    seeds:
+        Finished seeds of each entry, from the block's first on without a gap.
+    curves:
+        Their learning curves; entries without any are absent.
+    hours:
+        Core-hours of each entry, with its unfinished seeds.
+    decision:
+        Every pair with its verdict, p at each look, difference and interval.
     submitted:
         One line for each entry whose seeds were handed to a queue.
     """
 
     study: StudyWithLooks
-    state: StudyState
+    begun: bool
+    begun_at: str | None
+    ended: str | None
+    taken: Mapping[int, str]
+    seeds: Mapping[str, Sequence[int]]
+    curves: Mapping[str, LearningCurves]
+    hours: Mapping[str, float]
+    decision: Decision
     submitted: tuple[str, ...] = ()
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """How many seeds each open entry lacks for the next look; none where it has them."""
+        lacking = {name: count - len(self.seeds[name]) for name, count in self.decision.wanted.items()}
+        return {name: count for name, count in lacking.items() if count > 0}
 
     @property
     def pairs(self) -> tuple[PairDecision, ...]:
         """The compared pairs; `verdict` is a pair's decision in words."""
-        return self.state.decision.pairs
+        return self.decision.pairs
 
     @property
     def finished(self) -> bool:
         """Whether every pair is decided or its last look was taken."""
-        return self.state.decision.finished
+        return self.decision.finished
 
     @property
     def looked(self) -> dict[str, int]:
@@ -91,11 +113,11 @@ class StudyOutcome(Shown):
         looked = self.looked
         return {
             name: mean_time(replace(curves, values=curves.values[: looked[name]]), self.study.grid)
-            for name, curves in self.state.curves.items()
+            for name, curves in self.curves.items()
             if looked[name]
         }
 
-    def hours(self, seeds: Mapping[str, int]) -> Hours | None:
+    def cost(self, seeds: Mapping[str, int]) -> Hours | None:
         """Return the core-hours of seeds of several entries together; None where one is unknown.
 
         They are measured on an entry's own seeds, else estimated.
@@ -107,8 +129,8 @@ class StudyOutcome(Shown):
         return low, high
 
     def _hours(self, name: str, seeds: int) -> Hours | None:
-        if done := len(self.state.seeds[name]):
-            hours = seeds * self.state.hours[name] / done
+        if done := len(self.seeds[name]):
+            hours = seeds * self.hours[name] / done
             return hours, hours
         own = speed.find(self.study.entries[name], None, self.study.folder, self.study.runs)
         if own is None:
@@ -118,9 +140,9 @@ class StudyOutcome(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
-        study, state, decision = self.study, self.state, self.state.decision
+        study, decision = self.study, self.decision
         protocol = {name: entry.task.file.protocol.seeds for name, entry in study.entries.items()}
-        used = {name: len(state.seeds[name]) for name in study.entries}
+        used = {name: len(self.seeds[name]) for name in study.entries}
         closed = [name for name in study.entries if name not in decision.wanted]
         saved = {name: protocol[name] - used[name] for name in closed if used[name]}
         times = self.mean_times()
@@ -130,11 +152,11 @@ class StudyOutcome(Shown):
             "hash": study.hash,
             "task": study.task,
             "looks": study.looks.model_dump(mode="json") | {"levels": self.levels()},
-            "begun": state.begun,
+            "begun": self.begun,
             "finished": decision.finished,
-            "begun_at": state.begun_at,
-            "ended": state.ended,
-            "looks_taken": dict(state.taken),
+            "begun_at": self.begun_at,
+            "ended": self.ended,
+            "looks_taken": dict(self.taken),
             "pairs": [
                 {"question": asked or None, **self._pair(pair)}
                 for asked, pairs in by_question(study, decision.pairs)
@@ -145,19 +167,19 @@ class StudyOutcome(Shown):
                     "name": name,
                     "entry": entry.name,
                     "seeds": used[name],
-                    "core_hours": state.hours[name],
+                    "core_hours": self.hours[name],
                     "mean_time": times[name].mean if name in times else None,
                     "mean_time_interval": list(times[name].interval) if name in times else None,
                     "wanted": decision.wanted.get(name),
-                    "missing": state.missing.get(name, 0),
+                    "missing": self.missing.get(name, 0),
                 }
                 for name, entry in study.entries.items()
             ],
-            "next_core_hours": self.hours(state.missing),
+            "next_core_hours": self.cost(self.missing),
             "protocol_seeds": sum(protocol.values()),
             "seeds_saved": sum(saved.values()),
-            "core_hours_saved": self.hours(saved),
-            "core_hours_at_most": self.hours(dict.fromkeys(study.entries, study.design.looks[-1])),
+            "core_hours_saved": self.cost(saved),
+            "core_hours_at_most": self.cost(dict.fromkeys(study.entries, study.design.looks[-1])),
             "submitted": list(self.submitted),
         }
 
@@ -174,7 +196,7 @@ class StudyOutcome(Shown):
         ]
 
     def _pair(self, pair: PairDecision) -> dict[str, Any]:
-        decision = self.state.decision
+        decision = self.decision
         needs = None
         if pair.decided is None:
             look = len(pair.p)
@@ -208,9 +230,9 @@ class StudyOutcome(Shown):
 
     def parts(self) -> Iterator[Text | Sheet]:
         """Return the parts of a screen: the question; the design before the first seed, later the pairs; the cost."""
-        study, state, facts = self.study, self.state, self.as_dict()
+        study, facts = self.study, self.as_dict()
         yield Text(f"{study.name}: {study.file.summary}", style="bold")
-        if not state.begun:
+        if not self.begun:
             yield from map(Text, self._design())
         for asked, pairs in by_question(study, list(zip(self.pairs, facts["pairs"]))):
             if asked:
@@ -230,8 +252,8 @@ class StudyOutcome(Shown):
             )
         if note := horizon_note(self):
             yield Text(note)
-        if state.begun_at:
-            yield Text(f"hash {study.hash}, first seed begun {state.begun_at}")
+        if self.begun_at:
+            yield Text(f"hash {study.hash}, first seed begun {self.begun_at}")
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
         if note := reason_note(study):
@@ -275,7 +297,7 @@ class StudyOutcome(Shown):
 
     def _cost(self, facts: Mapping[str, Any]) -> Iterator[str]:
         """Describe the seeds and hours used and saved, and the next look."""
-        if not self.state.begun:
+        if not self.begun:
             most = facts["core_hours_at_most"]
             cost = (
                 f": {hours_range(*most)} core-hours"
@@ -285,8 +307,8 @@ class StudyOutcome(Shown):
             yield f"at most {len(self.study.entries) * self.study.design.looks[-1]} seeds{cost}"
             yield from self._measuring()
             return
-        if self.state.ended:
-            yield f"ended {self.state.ended}: open pairs stay open"
+        if self.ended:
+            yield f"ended {self.ended}: open pairs stay open"
         elif not self.finished:
             lacking = sum(each["missing"] for each in facts["entries"])
             yield f"next look: {counted(lacking, 'seed')} missing{_about(facts['next_core_hours'])}"
@@ -313,25 +335,6 @@ class StudyOutcome(Shown):
                 yield f"  {command('run', *words, '--seeds', seeds, '--epochs', '3', runs=study.runs)}"
 
 
-def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome], list[str]]:
-    """Return the outcomes of the studies that have begun in a results folder, and a line for each unreadable study.
-
-    Parameters
-    ----------
-    tasks:
-        Only studies of these tasks; all where empty.
-    """
-    outcomes, refused = [], []
-    for path in sorted((runs / looks.FOLDER).glob(f"*/{looks.FILE}")):
-        try:
-            study = StudyWithLooks(load_kept(path), runs)
-            if study.begun and (not tasks or study.task in tasks):
-                outcomes.append(StudyOutcome(study, study.read()))
-        except QrlSuiteError as error:
-            refused.append(str(error))
-    return outcomes, refused
-
-
 def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
     """Return each question of a study with its pairs, in order; the text is empty if the study asks none."""
     texts = study.questions or [""] * len(pairs)
@@ -351,7 +354,7 @@ def reason_note(study: StudyWithLooks) -> str:
     )
 
 
-def horizon_note(outcome: StudyOutcome) -> str:
+def horizon_note(outcome: State) -> str:
     """Explain a verdict at the horizon; empty without such a verdict."""
     if not any(map(outcome.late, outcome.pairs)):
         return ""
@@ -388,9 +391,9 @@ def _leading_text(pair: PairDecision, grid: Grid) -> str:
     return f"; at {grid.thresholds[pair.leading]:g}: {percent(pair.leading_difference)}, {ends}"
 
 
-def needs_text(outcome: StudyOutcome, needs: Mapping[str, Any] | None) -> str:
+def needs_text(outcome: State, needs: Mapping[str, Any] | None) -> str:
     """Describe the `needs` of an open pair from `as_dict`."""
-    if needs is None or outcome.state.ended:
+    if needs is None or outcome.ended:
         return ""
     requirement = f"p <= {needs['level']:.2g} at {needs['seeds']} seeds"
     about = needs["seeds_at_this_difference"]
@@ -413,7 +416,7 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _sheet(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Sheet:
+def _sheet(outcome: State, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Sheet:
     """Return the table of some pairs."""
     heads = ["pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"]
     rows = [
