@@ -75,47 +75,6 @@ def test_devices_pass_the_checks_of_backends(backend, options):
     assert "shots" in assert_all_good(registry.get(specs.CircuitBackendSpec, backend), options)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_circuit_without_variable_angles(backend):
-    circuit = Circuit(1)
-    circuit.append("X", 0)
-    circuit.append("RY", 0, 0.5)
-    values = create_backend(backend, circuit)(torch.zeros(2, 3, 1, dtype=torch.float64), {})
-    assert values.shape == (2, 3, 1)
-    assert_close([values], [torch.full((2, 3, 1), -np.cos(0.5), dtype=torch.float64)], 1e-12)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_backends_survive_without_gradients(backend):
-    circuit = ansatz("cx", 2, 1)
-    inputs, parameters, _ = draw(circuit, 2, 3)
-    with torch.no_grad():
-        values = create_backend(backend, circuit)(inputs, parameters)
-    assert not values.requires_grad
-    assert values.shape == (2, 3, 2)
-
-
-# Seeds must not influence each other.
-
-
-@pytest.mark.parametrize("qubits", [2, 3, 4, 5, 6])
-@pytest.mark.parametrize("batch", [1, 64])
-@pytest.mark.parametrize("name", ["iqp", "skolik"])
-def test_a_seed_has_the_same_bits_at_every_place_of_pennylanes_broadcast(name, batch, qubits):
-    circuit = ansatz(name, qubits, 2)
-    backend = create_backend("pennylane", circuit)
-    inputs, parameters, cotangent = draw(circuit, 3, batch)
-
-    def run(start, stop):
-        some = {key: value[start:stop] for key, value in parameters.items()}
-        return evaluate(backend, inputs[start:stop], some, cotangent[start:stop])
-
-    alone = [run(s, s + 1) for s in range(3)]
-    for start, stop in ((0, 3), (1, 3)):
-        for got, *each in zip(run(start, stop), *alone[start:stop], strict=True):
-            assert torch.equal(got, torch.cat(each))
-
-
 def test_seeds_that_do_not_fit_in_memory_are_recomputed_with_the_same_bits(monkeypatch):
     circuit = ansatz("iqp", 3, 2)
     backend = create_backend("pennylane", circuit)
@@ -310,14 +269,6 @@ def test_qiskit_runs_all_lanes_and_all_shifts_of_them_in_one_call(monkeypatch):
     lanes.clear()
     evaluate(create_backend("qiskit", circuit, gradient="parameter-shift"), *given)
     assert lanes == [12, 12 * 2 * 6]  # 6 rotations
-
-
-def test_a_lane_of_qiskit_has_the_same_bits_alone_and_among_many():
-    circuit = ansatz("iqp", 4, 2)
-    inputs, parameters, _ = draw(circuit, 8, 64)
-    backend = create_backend("qiskit", circuit)
-    one = {name: value[5:6] for name, value in parameters.items()}
-    assert torch.equal(backend(inputs, parameters)[5], backend(inputs[5:6], one)[0])
 
 
 def test_exact_values_differentiated_by_spsa_are_the_same_with_the_same_seeds():

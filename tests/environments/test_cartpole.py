@@ -19,7 +19,6 @@ from qrlsuite.plugins.environments.cartpole import (
     TAU,
     TOTAL_MASS,
     CartPoleLanes,
-    CartPoleOptions,
     parse,
 )
 
@@ -91,19 +90,6 @@ def test_gymnasium_step_for_step_from_given_states() -> None:
             np.testing.assert_array_equal(env.state[:, lane], one.state)
             np.testing.assert_array_equal(observations[lane], expected)
     assert episodes > 3
-
-
-def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
-    env = lanes(6, streams=2)
-    observations, _ = env.reset()
-    second = np.random.default_rng(1)
-    np.testing.assert_array_equal(env.state[:, 3:].T, second.uniform(-0.05, 0.05, (3, 4)))
-    alone = CartPoleLanes(CartPoleOptions(), 3)
-    alone.seed_lanes([np.random.default_rng(1)])
-    np.testing.assert_array_equal(alone.reset()[0], observations[3:])
-    env.state[2, [3, 5]] = 1.0  # two of the second stream's lanes fall; they are reset in their order
-    env.step(np.zeros(6, dtype=np.int64))
-    np.testing.assert_array_equal(env.state[:, [3, 5]].T, second.uniform(-0.05, 0.05, (2, 4)))
 
 
 def balance(state: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

@@ -70,26 +70,6 @@ def test_a_time_limit_truncates_and_an_end_terminates() -> None:
     assert not any(truncated.any() for _, truncated in flags)
 
 
-def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
-    env = lanes(WALK, 6, streams=2)
-    observations, _ = env.reset()
-    second = np.random.default_rng(1)
-    np.testing.assert_array_equal(env.state_dict()["seed"][3:], [second.integers(SEEDS) for _ in range(3)])
-    alone = lanes(WALK, 3, streams=1, first=1)
-    np.testing.assert_array_equal(alone.reset()[0], observations[3:])
-    for actions in np.random.default_rng(0).integers(0, 3, (40, 6)):
-        np.testing.assert_array_equal(alone.step(actions[3:])[0], env.step(actions)[0][3:])
-
-
-def test_lanes_that_end_together_are_reset_in_lane_order() -> None:
-    env, stream = lanes(f"{HERE}:Cut-v0", 4, streams=1), np.random.default_rng(0)
-    env.reset()
-    for _ in range(3):
-        np.testing.assert_array_equal(env.state_dict()["seed"], [stream.integers(SEEDS) for _ in range(4)])
-        for _ in range(4):
-            env.step(np.zeros(4, dtype=np.int64))
-
-
 def test_scores_come_from_info_where_there_are_any() -> None:
     for scored in (True, False):
         env = lanes(WALK, 4, scored=scored)
@@ -201,36 +181,6 @@ def test_masks_are_those_of_the_observations_that_are_returned() -> None:
         if terminated.any():
             ends = infos["final_info"]["action_mask"][terminated, 0]
             np.testing.assert_array_equal(ends, before[terminated] % 2)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "acts"), [("CartPole-v1", ""), ("FrozenLake-v1", ""), (WALK, ""), *((WALK, acts) for acts in ACTS)]
-)  # fmt: skip
-def test_resuming_is_exact_and_states_are_sliced_and_joined(env_id: str, acts: str) -> None:
-    more = {"acts": acts} if acts else {}
-    straight, stopped = lanes(env_id, 4, **more), lanes(env_id, 4, **more)
-    actions = action_spaces.draw(straight.single_action_space, np.random.default_rng(2), 75, 4)
-    straight.reset()
-    stopped.reset()
-    for row in actions[:40]:
-        straight.step(row)
-        stopped.step(row)
-    state = stopped.state_dict()
-    assert all(len(values) == 4 for values in state.values())
-    halves = []
-    for part in (slice(0, 2), slice(2, 4)):
-        half = GymLanes(env_id, 2, more)
-        half.seed_lanes(stopped.streams[part])
-        half.load_state_dict({name: values[part].copy() for name, values in state.items()})
-        halves.append((half, part))
-    for row in actions[40:]:
-        expected = straight.step(row)
-        for half, part in halves:
-            for values, wanted in zip(half.step(row[part])[:4], expected[:4]):
-                np.testing.assert_array_equal(values, wanted[part])
-    joined = {name: np.concatenate([half.state_dict()[name] for half, _ in halves]) for name in state}
-    for name, values in straight.state_dict().items():
-        np.testing.assert_array_equal(values, joined[name])
 
 
 def test_a_state_is_as_wide_as_the_time_limit() -> None:
