@@ -45,6 +45,10 @@ ASKED = ("generator", "space", "role")
 """What a model's class is built with where it has such a parameter, see `qrlsuite.specs.ModelSpec`."""
 
 
+PRIVATE = "_qrlsuite_"
+"""How the names of the targets of references begin."""
+
+
 def kebab(name: str) -> str:
     """Return the name under which a function or class is registered: `RingNet` becomes `ring-net`."""
     words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", lambda m: f"{m[1] or m[3]}-{m[2] or ''}", name)
@@ -179,6 +183,12 @@ def _title(thing: Any) -> str:
     return f"'{getattr(thing, '__name__', None) or repr(thing)[:60]}'"
 
 
+def put_targets(module: str, *things: Any) -> None:
+    """Put the options and builders of short forms into a module, for specs that refer to them."""
+    for thing in things:
+        spec_of(thing, sys.modules[module], module)
+
+
 class _Holder:
     """Puts the targets of references into a module."""
 
@@ -187,7 +197,7 @@ class _Holder:
 
     def put(self, word: str, value: Any) -> str:
         """Return the reference to a value."""
-        attribute = f"_qrlsuite_{self.name}_{word}"
+        attribute = f"{PRIVATE}{self.name}_{word}"
         known = str(value.__name__)
         if isinstance(value, type) and getattr(self.module, known, None) is value:
             return f"{self.module.__name__}:{known}"  # an options class that is written out

@@ -1,105 +1,44 @@
-"""New plugin packages, written from the templates beside this file.
+"""Makes a package of a plugin by path: its file or folder, hooks that register what it registered, a test, a README.
 
-A template `templates/KIND/NAME.jinja` becomes the file NAME of the package; templates in `templates/common` become
-files of every package.
+A function or class that is registered by its signature stays as it is: at the end of its file, `shortforms.put_targets`
+makes the options and the builder that the hooks name.
 """
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import importlib.util
 import keyword
-import math
+import os
 import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from qrlsuite import registry, specs
-from qrlsuite.errors import OptionError, QrlSuiteError
-
-if TYPE_CHECKING:
-    import jinja2
+from qrlsuite import own, specs
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.shortforms import PRIVATE
 
 TEMPLATES = Path(__file__).parent / "templates"
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 LONGEST = 40
-WAY = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95)
-"""Where a new task's thresholds lie on the way from the random to the best known score."""
+TRIED = {
+    "ansatz": "--task beam6g --model vqc-native --set ansatz={} --quick",
+    "model": "{} --task beam6g --quick",
+    "environment": "mlp --task {} --quick",
+    "task": "mlp --task {} --quick",
+    "algorithm": "'{} mlp' --task cartpole --quick",
+    "tracker": "mlp --task beam6g --quick --track {}",
+}
+"""What follows `qrlsuite run` to try a thing, by its kind."""
 
 
 class ScaffoldError(QrlSuiteError):
     """A plugin package cannot be written under that name or at that place."""
-
-
-class Kind(StrEnum):
-    """What a new plugin adds."""
-
-    ansatz = "ansatz"
-    model = "model"
-    environment = "environment"
-    algorithm = "algorithm"
-    task = "task"
-    tracker = "tracker"
-
-
-@dataclass(frozen=True)
-class _Words:
-    """Texts of a kind: a summary, the commands after installing, and the files besides registration.
-
-    A kind with a task has a range, too: the scores of random actions and of the best policy known.
-    """
-
-    summary: str
-    commands: tuple[str, ...]
-    files: dict[str, str]
-    range: tuple[float, float] | None = None
-
-
-_WORDS = {
-    Kind.ansatz: _Words(
-        "data re-uploading on a ring of qubits",
-        (
-            "qrlsuite show ansatz {thing}",
-            "qrlsuite run --task beam6g --model vqc-native --set ansatz={thing} --quick",
-        ),
-        {"ansatz.py": "the circuit: edit this"},
-    ),
-    Kind.model: _Words(
-        "a network with one hidden layer",
-        ("qrlsuite show model {thing}", "qrlsuite run --task beam6g --model {thing} --quick"),
-        {"model.py": "the network: edit this"},
-    ),
-    Kind.environment: _Words(
-        "walk along a line to a place",
-        ("qrlsuite show task {thing}", "qrlsuite run --task {thing} --model mlp --seeds 20"),
-        {"environment.py": "the environment: edit this", "task.toml": "a task with it: protocol and ranking"},
-        range=(0.65, 1.0),
-    ),
-    Kind.algorithm: _Words(
-        "policy gradient with a mean baseline",
-        (
-            "qrlsuite show algorithm {thing}",
-            "qrlsuite run {thing} mlp --task cartpole --quick",
-        ),
-        {"algorithm.py": "the algorithm: edit this"},
-    ),
-    Kind.task: _Words(
-        "balance a pole for 200 steps",
-        ("qrlsuite show task {thing}", "qrlsuite run --task {thing} --model mlp --quick"),
-        {"task.toml": "environment, protocol and ranking: edit this"},
-        range=(0.11, 1.0),
-    ),
-    Kind.tracker: _Words(
-        "every epoch as a line of a CSV file",
-        ("qrlsuite run --task beam6g --model mlp --quick --track {thing}=epochs.csv",),
-        {"tracker.py": "the tracker: edit this"},
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -110,168 +49,189 @@ class Package:
     ----------
     name:
         Name of the distribution: `acme-ring`.
-    module:
-        Name to import: `acme_ring`.
-    thing:
-        Registered name: the distribution's without a leading `qrlsuite-`.
     commands:
         Commands to type once it is installed.
     files:
-        Text by path within the package.
+        Content by path within the package.
     """
 
     name: str
-    module: str
-    thing: str
-    commands: tuple[str, ...]
-    files: dict[str, str]
+    commands: Sequence[str]
+    files: Mapping[str, bytes]
 
 
-def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) -> Package:
-    """Render a plugin package.
+def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
+    """Make a package of a plugin's file or folder.
 
     Parameters
     ----------
     name:
-        Name of the distribution, `acme-ring`: lower-case words and digits with single hyphens between them.
-    kind:
-        Kind of thing that it adds.
-    scores:
-        For a kind with a task: the scores of random actions and of the best policy known, between which its
-        thresholds are spread. Numbers outside [0, 1] are returns. Default: scores of the template's environment.
+        Name of the distribution; None takes the name of the file or folder.
     """
-    kinds: tuple[type[specs.Spec], ...] = (
-        specs.kind(kind),
-        *([specs.TaskSpec] if kind is Kind.environment else []),
-    )
-    module, thing = names_of(name, kinds)
-    template_words = _WORDS[kind]
-    checks = [
-        f"qrlsuite check {each.kind}:{thing}" for each in kinds
-    ]  # with the kind: the distribution has the same name
-    commands = tuple(line.format(thing=thing) for line in ("pytest", *checks, *template_words.commands))
-    source = f"src/{module}"
-    contents = {
-        f"{source}/__init__.py": f"registers the {kind} with qrlsuite",
-        **{f"{source}/{file}": meaning for file, meaning in template_words.files.items()},
-        f"tests/test_{module}.py": "runs qrlsuite's checks",
+    source = own.read(path)
+    module = source.module
+    if others := sorted(source.modules - {module}):
+        raise ScaffoldError(f"{path} imports {others[0]}.py: make a package's folder of both")
+    usual = module.strip("_").replace("_", "-")
+    for each in {usual, name or usual}:
+        _require_usable(each)
+    loaded = own.load_source(source)
+    own.unload(loaded)
+    registered = [each.spec for each in loaded.registered]
+    top = f"{module}/__init__.py" if source.name == module else source.name
+    text = source.files[top].decode()
+    tree = ast.parse(text)
+    files = {
+        f"src/{file if source.name == module else f'{module}/{file}'}": content
+        for file, content in source.files.items()
+        if file != top
     }
+    first = f"src/{module}/__init__.py"
+    contents = {first: "registers with qrlsuite"}
+    if _has_hooks(tree):
+        files[first] = text.encode()
+    else:
+        inner = "parts" if source.name == module else module
+        if f"src/{module}/{inner}.py" in files:
+            raise ScaffoldError(
+                f"{source.path} has a file parts.py, in whose place its __init__.py would be: rename it"
+            )
+        files[first] = _registration(registered, module, inner).encode()
+        files[f"src/{module}/{inner}.py"] = _with_targets(text, tree, registered).encode()
+        contents[f"src/{module}/{inner}.py"] = f"what was {source.name}: edit this"
+    contents[f"tests/test_{module}.py"] = "runs qrlsuite's checks"
+    commands = ["pytest"]
+    for spec in registered:
+        commands.append(f"qrlsuite check {spec.kind.replace('_', '-')}:{spec.name}")
+        if spec.kind in TRIED:
+            commands.append(f"qrlsuite run {TRIED[spec.kind].format(spec.name)}")
+    summary = " ".join(registered[0].summary.rstrip(".").split()) if registered else f"commands of {module}"
     values = {
-        "name": name,
+        "name": name or usual,
         "module": module,
-        "thing": thing,
-        "kind": str(kind),
-        "article": "an" if kind[0] in "ae" else "a",
-        "summary": template_words.summary,
-        "things": [(each.kind, thing) for each in kinds],
-        "check": checks[0],
+        "thing": registered[0].name if registered else usual,
+        "things": [(spec.kind, spec.name) for spec in registered],
+        "summary": re.sub(r'["\\]', "'", summary),
         "commands": commands,
         "contents": list(contents.items()),
-        "files": any(file.endswith(".toml") for file in template_words.files),
-        **_ranking(kind, scores),
+        "suffixes": sorted({f"*{Path(file).suffix}" for file in files if not file.endswith(".py")}),
+        "versions": compatible_versions(),
     }
-
-    def render(template: str) -> str:
-        return _templates().get_template(template).render(values)
-
-    files = rendered(values)
-    for path in contents:
-        template = "test.py" if path.startswith("tests/") else Path(path).name
-        if path not in files or (TEMPLATES / kind / f"{template}.jinja").exists():
-            files[path] = render(f"{kind}/{template}.jinja")
-    files[f"{source}/py.typed"] = ""
-    return Package(name, module, thing, commands, files)
+    common = _rendered(values)
+    return Package(name or usual, commands, {**common, **files, f"src/{module}/py.typed": b""})
 
 
-def rendered(values: Mapping[str, object]) -> dict[str, str]:
+def _rendered(values: Mapping[str, object]) -> dict[str, bytes]:
     """Return the files of every package, with values in the places that their templates have for them."""
-    templates = {name: name for name in ("pyproject.toml", "README.md")}
-    templates[f"tests/test_{values['module']}.py"] = "test.py"
-    return {
-        path: _templates()
-        .get_template(f"common/{template}.jinja")
-        .render({**values, "versions": compatible_versions()})
-        for path, template in templates.items()
-    }
-
-
-def commands_of(kind: str, thing: str) -> tuple[str, ...]:
-    """Return the commands for a thing once it is installed; empty if its kind has no template."""
-    return (
-        tuple(line.format(thing=thing) for line in _WORDS[Kind(kind)].commands)
-        if kind in Kind.__members__
-        else ()
-    )
-
-
-def _templates() -> jinja2.Environment:
     import jinja2
 
-    return jinja2.Environment(
+    templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,
         keep_trailing_newline=True,
-        autoescape=False,  # Python and TOML, of names that `names_of` has checked
+        autoescape=False,  # Python and TOML, of names that are checked
     )
-
-
-def _ranking(kind: Kind, scores: tuple[float, float] | None) -> dict[str, object]:
-    """Return the range of scores and the thresholds for a task's template."""
-    usual = _WORDS[kind].range
-    if usual is None:
-        if scores is not None:
-            raise OptionError(f"--range: a new {kind} has no task; it goes with --kind task or environment")
-        return {}
-    worst, best = scores or usual
-    span = best - worst
-    if not 0 < span < math.inf:
-        raise OptionError(
-            f"--range {worst:g} {best:g}: give two numbers, the score of random actions and then the best known "
-            "one, which is larger"
-        )
-    digits = 2 - math.floor(math.log10(span))
-    relative = worst >= 0 and best <= 1
-    levels = [worst + part * span for part in WAY]
-    cells = [round(1 - level if relative else level, digits) for level in levels]
+    names = {"pyproject.toml": "pyproject.toml", "README.md": "README.md"}
+    names[f"tests/test_{values['module']}.py"] = "test.py"
     return {
-        "relative": relative,
-        "random": worst,
-        "best": best,
-        "way": ", ".join(f"{part:.0%}" for part in WAY),
-        "cells": sorted(cells),
-        "reference": cells[WAY.index(0.9)],
+        path: templates.get_template(f"{name}.jinja").render(values).encode() for path, name in names.items()
     }
 
 
-def names_of(name: str, kinds: Sequence[type[specs.Spec]]) -> tuple[str, str]:
-    """Check a distribution's name; returns the module's name and the registered name.
-
-    Parameters
-    ----------
-    kinds:
-        Kinds in which the registered name must be free.
-    """
+def _require_usable(name: str) -> None:
+    """Refuse a name that a distribution cannot have, or whose module Python has already."""
     if not NAME.fullmatch(name) or len(name) > LONGEST:
         usable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")[:LONGEST].rstrip("-")
         raise ScaffoldError(
             f"'{name}' cannot be the name of a package: lower-case letters, digits and single hyphens, beginning with "
             f"a letter, {LONGEST} characters at most" + (f"; for example {usable}" if usable else "")
         )
-    module, thing = name.replace("-", "_"), name.removeprefix("qrlsuite-")
+    module = name.replace("-", "_")
     if keyword.iskeyword(module) or module in sys.stdlib_module_names:
         raise ScaffoldError(f"'{module}' is a word of Python; for example acme-{name}")
     if importlib.util.find_spec(module) is not None:
         raise ScaffoldError(
             f"a module '{module}' is installed already: choose another name, for example acme-{name}"
         )
-    for each in kinds:
-        if thing in registry.load().of(each):
-            article = "an" if each.kind[0] in "ae" else "a"
-            raise ScaffoldError(
-                f"there is {article} {specs.title(each, thing)} already (`qrlsuite list {each.kinds}`): "
-                f"choose another name, for example acme-{thing}"
-            )
-    return module, thing
+
+
+def _has_hooks(tree: ast.Module) -> bool:
+    return any(
+        isinstance(node, ast.FunctionDef)
+        and any("hookimpl" in ast.unparse(each) for each in node.decorator_list)
+        for node in tree.body
+    )
+
+
+def _with_targets(text: str, tree: ast.Module, registered: Sequence[specs.Spec]) -> str:
+    """Return a file's text without calls of `register`; at its end, the targets of its short forms are made."""
+    lines = text.splitlines(keepends=True)
+    for first, last, line in _register(tree):
+        lines[first - 1 : last] = [line, *[""] * (last - first)]
+    references = [str(getattr(spec, each.name)) for spec in registered for each in dataclasses.fields(spec)]
+    targets = [match[1] for each in references if (match := re.search(rf":{PRIVATE}(.+)_[a-z]+$", each))]
+    body = "".join(lines).strip("\n") + "\n"
+    if not targets:
+        return body
+    return (
+        f"{body}\n\nfrom qrlsuite.shortforms import put_targets  # noqa: E402\n\n"
+        f"# the options and builders that __init__.py refers to\n"
+        f"put_targets(__name__, {', '.join(dict.fromkeys(targets))})\n"
+    )
+
+
+def _register(tree: ast.Module) -> Iterator[tuple[int, int, str]]:
+    """Yield the lines of code that calls or imports `register`, and their replacement."""
+
+    def named(node: ast.expr) -> bool:
+        return (node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")) == "register"
+
+    for node in tree.body:
+        last = node.end_lineno or node.lineno
+        for each in getattr(node, "decorator_list", []):
+            if named(each):
+                yield each.lineno, each.end_lineno, ""
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) and named(node.value.func):
+            yield node.lineno, last, ""
+        if isinstance(node, ast.ImportFrom) and node.module in ("qrlsuite", "qrlsuite.api"):
+            left = [alias for alias in node.names if alias.name != "register"]
+            if len(left) < len(node.names):
+                kept = f"{ast.unparse(ast.ImportFrom(node.module, left, 0))}\n" if left else ""
+                yield node.lineno, last, kept
+
+
+def _registration(registered: Sequence[specs.Spec], module: str, inner: str) -> str:
+    """Return a module of hooks that register specs."""
+    pieces = [
+        '"""What qrlsuite loads at every start: register here, import nothing heavy."""\n\n'
+        "from __future__ import annotations\n\nfrom collections.abc import Callable\n\n"
+        "from qrlsuite import hookimpl, specs\n"
+    ]
+    for kind in dict.fromkeys(map(type, registered)):
+        calls = [spec for spec in registered if type(spec) is kind]
+        pieces.append(
+            f"@hookimpl\ndef register_{kind.kinds}(register: Callable[[specs.{kind.__name__}], None]) -> None:\n"
+            f'    """Register {", ".join(spec.name for spec in calls)}."""\n'
+            + "".join(_call(spec, module, inner) for spec in calls)
+        )
+    return "\n\n".join(pieces)
+
+
+def _call(spec: specs.Spec, module: str, inner: str) -> str:
+    lines = []
+    for each in dataclasses.fields(spec):
+        value = getattr(spec, each.name)
+        if each.default is not dataclasses.MISSING and value == each.default:
+            continue
+        if not value and each.default_factory is not dataclasses.MISSING:
+            continue
+        if isinstance(value, str):
+            value = re.sub(rf"^{module}:", f"{module}.{inner}:", value)
+            written = '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        else:
+            written = repr(value)
+        lines.append(f"            {each.name}={written},\n")
+    return f"    register(\n        specs.{type(spec).__name__}(\n{''.join(lines)}        )\n    )\n"
 
 
 def compatible_versions() -> str:
@@ -291,10 +251,10 @@ def write(package: Package, out: Path) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{package.name}-", dir=out) as temporary:
             draft = Path(temporary) / package.name
-            for path, text in package.files.items():
+            for path, content in package.files.items():
                 file = draft / path
                 file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_text(text, encoding="utf-8")
+                file.write_bytes(content)
             shutil.move(draft, folder)
     except OSError as error:
         raise ScaffoldError(f"{folder} cannot be written: {error.strerror or error}") from None

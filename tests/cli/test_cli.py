@@ -362,10 +362,9 @@ study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20 margn=1' => opti
 study new p --task tiny.toml mlp 'mlp width=4' => p: a study file's name ends in .toml
 study new 'p q.toml' --task tiny.toml mlp 'mlp width=4' => name
 study new tiny.toml --task tiny.toml mlp 'mlp width=4' => tiny.toml is there already
-new plugin acme-ring => name the package and what it adds, for example acme-ring --kind ansatz
+new plugin acme-ring => name the file that it is made of: --from ring.py
 new plugin --from part.py => part.py imports ring.py: make a package's folder of both
 new plugin --from none.py => there is no plugin none.py
-new plugin --from ring.py --kind ansatz => leave --kind and --range out
 new plugin --from ring.py Ring => 'Ring' cannot be the name of a package
 list ansatzes --plugin => --plugin needs a path, for example --plugin ring.py
 list ansatzes --plugin none.py => there is no plugin none.py

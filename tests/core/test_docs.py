@@ -99,7 +99,7 @@ def parsed(words: list[str]) -> tuple[str, dict[str, Any]]:
 
 def test_the_parser_finds_what_is_wrong() -> None:
     assert not parse(["run", "--task", "beam6g", "--model", "mlp", "--quick"])
-    assert not parse(["new", "plugin", "x", "--kind", "task"])
+    assert not parse(["new", "plugin", "x", "--from", "ring.py"])
     assert "No such command" in parse(["runn"])
     assert "No such option" in parse(["run", "--task", "beam6g", "--model", "mlp", "--quickly"])
     assert "is not one of" in parse(["leaderboard", "--format", "pdf"])

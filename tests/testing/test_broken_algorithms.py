@@ -1,4 +1,4 @@
-"""Algorithms that break one rule each: edits of the one that `new plugin` writes."""
+"""Algorithms that break one rule each: edits of a good one."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 
 from qrlsuite.errors import PluginError
-from qrlsuite.scaffold import Kind
 from qrlsuite.specs import AlgorithmSpec
-from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, own_rules, template
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, good, ids, module, own_rules
 
-GOOD = template(Kind.algorithm)
+GOOD = good("algorithm")
 INIT, ACT = "self.observations = torch.zeros(0)", "logits.argmax(2).cpu().numpy()"
 LOSS, POLICY, SEEN = '{"loss": loss}', "dict(self.policy.state_dict())", '"observations": self.observations,'
 EPOCH, RESTORED = "torch.full((self.S,), self.epoch)", 'self.epoch = int(state["epoch"][0])'
@@ -98,7 +97,8 @@ EDITS = [
     edit("state", r"current observations and the epoch's number belong into state_dict\(\)",
          'state["observations"].clone()', 'torch.zeros_like(state["observations"])'),
     edit("state", r"no attribute 'room'; load_state_dict\(\) takes .* in place of start\(\)",
-         '"""Reset the environments."""', "self.room = torch.zeros(1)", RESTORED, f"self.room.zero_(); {RESTORED}"),
+         "def start(self) -> None:", "def start(self):\n        self.room = torch.zeros(1)",
+         RESTORED, f"self.room.zero_(); {RESTORED}"),
 ]  # fmt: skip
 
 
@@ -119,7 +119,7 @@ def test_every_rule_has_an_algorithm_that_breaks_it() -> None:
 
 
 def test_a_kind_of_actions_that_is_promised_and_not_taken_is_named() -> None:
-    """The template takes discrete actions; a spec that promises more is told for which space it fails."""
+    """The good one takes discrete actions; a spec that promises more is told for which space it fails."""
     promised = replace(spec(), actions=("discrete", "box"))
     findings = {finding.rule: finding for finding in own_rules(promised)}
     assert not findings["box actions"].ok

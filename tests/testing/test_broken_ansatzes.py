@@ -1,4 +1,4 @@
-"""Ansatzes that break one rule each: edits of the one that `new plugin` writes."""
+"""Ansatzes that break one rule each: edits of a good one."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from torch import Tensor
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend
 from qrlsuite.errors import OptionError
-from qrlsuite.scaffold import Kind
 from qrlsuite.specs import AnsatzSpec, CircuitBackendSpec
 from qrlsuite.testing import effects
-from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, own_rules, template
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, good, ids, module, own_rules
 
-GOOD = template(Kind.ansatz)
+GOOD = good("ansatz")
 CIRCUIT, RETURN = "circuit = Circuit(qubits)", "return circuit"
 SCALING = 'scaling = circuit.parameter("scaling", (layers, qubits), low=1.0, high=1.0)'
 SHAPE, COUPLING = "(layers, qubits))", 'coupling = circuit.parameter("coupling", (layers, qubits))'

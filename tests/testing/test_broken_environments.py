@@ -1,13 +1,12 @@
-"""Environments that break one rule each: edits of the one that `new plugin` writes, and of one in lanes."""
+"""Environments that break one rule each: edits of a good one, and of one in lanes."""
 
 from __future__ import annotations
 
 import pytest
 
-from qrlsuite.scaffold import Kind
 from qrlsuite.specs import EnvironmentSpec
 from qrlsuite.testing import check
-from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, template
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, good, ids, module
 
 LANES = '''
 from gymnasium.spaces import Box, Discrete
@@ -71,7 +70,7 @@ def nothing(options, num_envs):
 def always_ten(options, num_envs):
     return Lanes(options, 10)
 '''
-GOOD = template(Kind.environment).replace("] = 20", "] = 6") + LANES
+GOOD = good("environment").replace("] = 20", "] = 6") + LANES
 SPACES = "Box(0, 1, (2,)), Discrete(2)"
 STREAM = "self.streams[lane // per_stream].random() for lane in lanes"
 SEEN, REWARD, DONE, INFOS = (

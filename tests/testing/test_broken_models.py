@@ -1,4 +1,4 @@
-"""Models that break one rule each: edits of the one that `new plugin` writes."""
+"""Models that break one rule each: edits of a good one."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from qrlsuite import population
-from qrlsuite.scaffold import Kind
 from qrlsuite.specs import ModelSpec
 from qrlsuite.testing import model as rules
 from qrlsuite.testing.common import Subject
-from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, own_rules, template
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, good, ids, module, own_rules
 
 HERE = __name__
-GOOD = template(Kind.model).replace("import torch\n", "import random\n\nimport torch\n", 1)
+GOOD = good("model").replace("import torch\n", "import random\n\nimport torch\n", 1)
 WIDTH = 'Annotated[int, Field(ge=1, description="units of the hidden layer")] = 32'
 INIT, FORWARD = "self.out = nn.Linear(width, outputs)", "y: Tensor = self.out(torch.tanh(self.hidden(x)))"
 EDGE = f"{INIT}; self.edge = nn.Parameter(torch.zeros(1))"

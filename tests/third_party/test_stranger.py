@@ -147,8 +147,9 @@ def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Ins
 
 
 def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:
-    installed.qrlsuite("new", "plugin", "acme-next", "--kind", "model")
-    assert (installed.folder / "acme-next" / "src" / "acme_next" / "model.py").exists()
+    (installed.folder / "following.py").write_text("def following(qubits, layers): ...\n")
+    installed.qrlsuite("new", "plugin", "acme-next", "--from", "following.py")
+    assert (installed.folder / "acme-next" / "src" / "following" / "__init__.py").exists()
 
 
 def test_it_passes_its_own_test(installed: Installation) -> None:

@@ -12,10 +12,9 @@ import typer
 from qrlsuite import scaffold
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.errors import OptionError
-from qrlsuite.scaffold import Kind, from_file
 
 app = typer.Typer(
-    help="Write a new plugin package.\n\nExample: qrlsuite new plugin acme-ring --kind ansatz",
+    help="Write a new plugin package.\n\nExample: qrlsuite new plugin --from ring.py",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -25,7 +24,7 @@ app = typer.Typer(
 def new() -> None:
     """Write a new plugin package.
 
-    Example: qrlsuite new plugin acme-ring --kind ansatz
+    Example: qrlsuite new plugin --from ring.py
     """
 
 
@@ -34,44 +33,30 @@ def plugin(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME]",
-            help="Name of the package, and of the thing that it registers: acme-ring. With --from: the file's name.",
+            metavar="[NAME]", help="Name of the package: acme-ring. Default: the name of the file or folder."
         ),
     ] = None,
-    kind: Annotated[Kind | None, typer.Option("--kind", help="Kind of thing that it adds.")] = None,
     source: Annotated[
         Path | None,
-        typer.Option("--from", metavar="PATH", help="Make the package of a plugin that lies there: ring.py."),
-    ] = None,
-    scores: Annotated[
-        tuple[float, float] | None,
         typer.Option(
-            "--range",
-            metavar="RANDOM BEST",
-            help="For a task: the score of random actions and the best known one, between which its thresholds are "
-            "spread. Numbers outside 0..1 are returns. Default: scores of the template's environment.",
+            "--from", metavar="PATH", help="The plugin's file, or the folder of its package: ring.py."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder to write it into.")] = Path(),
     json_output: JsonOption = False,
 ) -> None:
-    """Write a package that works at once: pyproject.toml, code to edit, a test, a README.
+    """Write a package of a plugin that is a file: pyproject.toml, hooks, its code, a test, a README.
 
-    Nothing is overwritten. What is in it can be installed (`pip install -e .`), passes `qrlsuite check`, and can be
-    run; edit it from there.
+    Nothing is overwritten. The package can be installed (`pip install -e .`), and `pytest` checks it. docs/plugins.md
+    has files to begin with: a circuit, a network and an algorithm.
 
-    Examples: qrlsuite new plugin acme-ring --kind ansatz; qrlsuite new plugin --from ring.py
+    Examples: qrlsuite new plugin --from ring.py; qrlsuite new plugin acme-ring --from ring.py
     """
-    if source is not None and (kind is not None or scores is not None):
-        raise OptionError("--from PATH says what the package adds: leave --kind and --range out")
-    if source is not None:
-        files = from_file.package(source, name)
-    elif name is None or kind is None:
+    if source is None:
         raise OptionError(
-            "name the package and what it adds, for example acme-ring --kind ansatz; or a file, --from ring.py"
+            "name the file that it is made of: --from ring.py; docs/plugins.md has files to begin with"
         )
-    else:
-        files = scaffold.package(name, kind, scores)
+    files = scaffold.package(source, name)
     folder = scaffold.write(files, out)
     if json_output:
         content = {"folder": str(folder), "files": sorted(files.files), "next": list(files.commands)}

@@ -1,4 +1,4 @@
-"""A circuit family: data re-uploading, and a ring of entangling gates."""
+"""A circuit that keeps the rules of ansatzes, which the tests beside this folder break one by one."""
 
 from __future__ import annotations
 
@@ -6,24 +6,18 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
+
 from qrlsuite.circuit import Circuit
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
-    """Options; `qrlsuite show ansatz {{ thing }}` lists them."""
-
-    entangler: Annotated[
-        Literal["CZ", "CNOT"], Field(description="gate between neighbors of the ring")
-    ] = "CZ"
+    entangler: Annotated[Literal["CZ", "CNOT"], Field(description="gate between neighbors of the ring")] = (
+        "CZ"
+    )
 
 
 def build(qubits: int, layers: int, options: Options) -> Circuit:
-    """Build the circuit; every layer uploads all inputs anew.
-
-    Layer l: RY(scaling[l, q] * input[q]) on every qubit q, the ring, then
-    RY(weights[l, q]) on every qubit.
-    """
     circuit = Circuit(qubits)
     scaling = circuit.parameter("scaling", (layers, qubits), low=1.0, high=1.0)
     weights = circuit.parameter("weights", (layers, qubits))
@@ -38,6 +32,5 @@ def build(qubits: int, layers: int, options: Options) -> Circuit:
 
 
 def ring(qubits: int) -> list[tuple[int, int]]:
-    """Return the pairs of a closed ring; two qubits have one, one qubit has none."""
     pairs = [(q, (q + 1) % qubits) for q in range(qubits)]
     return pairs if qubits > 2 else pairs[: qubits - 1]

@@ -1,4 +1,4 @@
-"""An environment: an ordinary `gymnasium.Env`, here with discrete actions."""
+"""A walk that keeps the rules of environments, which the tests beside this folder break one by one."""
 
 from __future__ import annotations
 
@@ -14,26 +14,11 @@ from pydantic.dataclasses import dataclass
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
-    """Options: the keyword arguments of the environment."""
-
     size: Annotated[int, Field(ge=2, description="number of places")] = 10
     steps: Annotated[int, Field(ge=1, description="steps of an episode")] = 20
 
 
 class Walk(gymnasium.Env[NDArray[np.float32], np.int64]):
-    """Walk along a line to a place that is drawn anew for every episode.
-
-    Actions
-        0 left, 1 stay, 2 right.
-    Observation
-        The walker's place and the place to go to, each in [0, 1].
-    Reward
-        1 at the place to go to, less with distance, 0 at the other end.
-    Episode end
-        Terminated after `steps` steps. Then `info["score"]` is the sum of rewards
-        over the largest possible one: in [0, 1], and 1 for the best policy.
-    """
-
     def __init__(self, size: int = 10, steps: int = 20) -> None:
         self.size, self.steps = size, steps
         self.action_space = Discrete(3)
@@ -42,21 +27,16 @@ class Walk(gymnasium.Env[NDArray[np.float32], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode; every random number comes from `self.np_random`."""
         super().reset(seed=seed)
         place, goal = self.np_random.integers(self.size, size=2)
         self.place, self.goal = int(place), int(goal)
         self.step_count, self.received = 0, 0.0
         self.best = sum(
-            self.reward(max(0, abs(self.place - self.goal) - k))
-            for k in range(1, self.steps + 1)
+            self.reward(max(0, abs(self.place - self.goal) - k)) for k in range(1, self.steps + 1)
         )
         return self.observe(), {}
 
-    def step(
-        self, action: np.int64
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Walk one step."""
+    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         self.place = min(max(self.place + int(action) - 1, 0), self.size - 1)
         reward = self.reward(abs(self.place - self.goal))
         self.received += reward
@@ -66,10 +46,8 @@ class Walk(gymnasium.Env[NDArray[np.float32], np.int64]):
         return self.observe(), reward, ended, False, info
 
     def reward(self, distance: int) -> float:
-        """Return the reward at a distance from the goal."""
         return 1.0 - distance / (self.size - 1)
 
     def observe(self) -> NDArray[np.float32]:
-        """Return the observation."""
         places = np.array([self.place, self.goal], dtype=np.float32)
         return places / np.float32(self.size - 1)

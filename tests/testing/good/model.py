@@ -1,4 +1,4 @@
-"""A function approximator: one agent's network; qrlsuite makes populations of it."""
+"""A network that keeps the rules of models, which the tests beside this folder break one by one."""
 
 from __future__ import annotations
 
@@ -12,31 +12,19 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
-    """Options; `qrlsuite show model {{ thing }}` lists them."""
-
     width: Annotated[int, Field(ge=1, description="units of the hidden layer")] = 32
 
 
 class Network(nn.Module):
-    """One hidden layer with tanh; (B, inputs) -> (B, outputs)."""
-
     def __init__(self, inputs: int, outputs: int, width: int) -> None:
         super().__init__()
         self.hidden = nn.Linear(inputs, width)
         self.out = nn.Linear(width, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map observations (B, inputs) to outputs (B, outputs)."""
         y: Tensor = self.out(torch.tanh(self.hidden(x)))
         return y
 
 
-def build(
-    obs_dim: int, out_dim: int, options: Options, generator: torch.Generator
-) -> Network:
-    """Build one agent's network; qrlsuite calls this once for every seed.
-
-    Initial values come from the generator, or as here from torch's default one: while
-    this runs, it follows from the seed, too.
-    """
+def build(obs_dim: int, out_dim: int, options: Options, generator: torch.Generator) -> Network:
     return Network(obs_dim, out_dim, options.width)

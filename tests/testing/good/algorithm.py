@@ -1,11 +1,4 @@
-"""A policy gradient in one file: softmax policy, reward-to-go, mean baseline.
-
-    G_t  = r_t + gamma G_{t+1}, 0 beyond an episode's end and an epoch's end
-    loss = - mean_t (G_t - mean G) log pi(a_t | s_t)
-
-One step of Adam per epoch. All S seeds learn at once: every tensor has the seed first,
-and the loss is the sum of the agents' own, so that their gradients do not mix.
-"""
+"""A policy gradient that keeps the rules of algorithms, which the tests beside this folder break one by one."""
 
 from __future__ import annotations
 
@@ -17,27 +10,24 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
+from torch import Tensor
+
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
 from qrlsuite.population import Adam, part, prefixed
 from qrlsuite.seeding import Streams
-from torch import Tensor
 
 BLOCK = 128  # steps per forward pass of each agent: bounds the memory of circuits
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
-    """Options; `qrlsuite show algorithm {{ thing }}` lists them."""
-
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
     lr: Annotated[float, Field(gt=0, description="learning rate")] = 1e-2
     quantum_lr: Annotated[float, Field(gt=0, description="that of circuits")] = 1e-3
 
 
 class PolicyGradient:
-    """S agents with E environments each; see `qrlsuite.algorithm.Algorithm`."""
-
     def __init__(
         self,
         envs: LaneEnv,
@@ -55,11 +45,9 @@ class PolicyGradient:
         self.observations = torch.zeros(0)
 
     def start(self) -> None:
-        """Reset the environments."""
         self.observations = self.tensor(self.envs.reset()[0])
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
-        """Step every environment `rounds` times, then learn; metrics are (S,)."""
         shape = (self.S, rounds, self.E)
         draws = [streams.numpy("exploration", self.epoch) for streams in self.streams]
         size = (rounds, self.E, self.actions)
@@ -89,13 +77,7 @@ class PolicyGradient:
         loss = self.learn(torch.cat(states, 1), torch.cat(actions, 1), returns)
         return {"loss": loss}
 
-    def learn(
-        self, states: Tensor, actions: Tensor, returns: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Make one update of every agent from its N steps; returns the losses (S,).
-
-        States are (S, N, obs), actions (S, N), returns (S, rounds, E): N = rounds x E.
-        """
+    def learn(self, states: Tensor, actions: Tensor, returns: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = returns.reshape(self.S, -1)
         centered = (flat - flat.mean(1, keepdims=True)) / flat.shape[1]
         advantages = torch.from_numpy(centered.astype(np.float32)).to(self.device)
@@ -114,23 +96,19 @@ class PolicyGradient:
         return losses
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return greedy actions (S, B) for observations (S, B, obs)."""
         with torch.no_grad():
             logits = self.policy(torch.from_numpy(observations).to(self.device))
         chosen: NDArray[np.int64] = logits.argmax(2).cpu().numpy()
         return chosen
 
     def tensor(self, lanes: NDArray[np.float32]) -> Tensor:
-        """Reshape lanes (S * E, ...) to (S, E, obs)."""
         values = torch.from_numpy(np.array(lanes, dtype=np.float32))
         return values.view(self.S, self.E, -1).to(self.device)
 
     def policy_state(self) -> dict[str, Tensor]:
-        """Return what is published as the trained agents."""
         return dict(self.policy.state_dict())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return all that training depends on, seed first."""
         return {
             **prefixed(policy=self.policy.state_dict(), adam=self.adam.state_dict()),
             "observations": self.observations,
@@ -138,7 +116,6 @@ class PolicyGradient:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
         self.policy.load_state_dict(part(state, "policy"))
         self.adam.load_state_dict(part(state, "adam"))
         self.observations = state["observations"].clone().to(self.device)
