@@ -95,9 +95,8 @@ def read(selection: Selection, members: Sequence[Member]) -> dict[str, EntryResu
 
 
 def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryResults]:
-    """Return the copies of an entry that have the code of the first copy."""
-    stores = [EntryStore.find(folder, entry) for folder in folders]
-    found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
+    """Return the copies of an entry of one code, the first of `collect.by_code`."""
+    found = [collect.read(store) for folder in folders for store in EntryStore.of_name(folder, entry)]
     return next(iter(collect.by_code(curves for curves in found if curves is not None)), [])
 
 

@@ -317,8 +317,8 @@ def on_board(
         reached = entry.reaching(end // entry.steps_per_epoch)
         if reached is not None and len(reached.seeds) >= MIN_RUNS:
             ranked.append(reached)
-    places = [(entry.folder, entry.codes) for entry in ranked]  # a board calls one of two copies another name
-    pair = (first.folder, first.codes), (second.folder, second.codes)
+    places = [entry.folder for entry in ranked]  # a board calls one of two copies another name
+    pair = first.folder, second.folder
     if len(ranked) < 3 or not set(pair) <= set(places):
         return None
     curves = [LearningCurves(each.curves, each.steps_per_epoch, str(k)) for k, each in enumerate(ranked)]

@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 
 from qrlsuite.engine.terminal import printable
-from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf import published as published_entries
@@ -24,6 +24,8 @@ from qrlsuite.leaderboard.shelf.curves import (
 from qrlsuite.results import codes, genuine, lookup, probes
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import ANOTHER_FOLDER, EntryStore, SeedRun, entries
+from qrlsuite.results.text import counted
+from qrlsuite.statistics.compare import MIN_RUNS
 
 Key = tuple[str, str]
 """An entry's task and name."""
@@ -43,19 +45,27 @@ class Selection:
         The tasks whose entries are read, all if empty: their names, or before `named` the user's words.
     only:
         The only entries to read, of studies or not, whatever their task; None for the entries that boards rank.
+    all_codes:
+        Whether to read each entry of every code, and not only of the newest code with enough seeds to rank.
     """
 
     runs: Path
     published: bool = False
     tasks: tuple[str, ...] = ()
     only: Collection[Key] | None = None
+    all_codes: bool = False
 
     @classmethod
     def create(
-        cls, runs: str | PathLike[str], task: str | Sequence[str] | None = None, published: bool = False
+        cls,
+        runs: str | PathLike[str],
+        task: str | Sequence[str] | None = None,
+        published: bool = False,
+        all_codes: bool = False,
     ) -> Selection:
         """Make a selection from the arguments of a command or of `qrlsuite.api`; tasks stay in the user's words."""
-        return cls(Path(runs), published, (task,) if isinstance(task, str) else tuple(task or ()))
+        tasks = (task,) if isinstance(task, str) else tuple(task or ())
+        return cls(Path(runs), published, tasks, all_codes=all_codes)
 
     def of(self, *tasks: str) -> Selection:
         """Return the selection of other tasks."""
@@ -102,29 +112,36 @@ def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
         stores = [store for store in _stores(selection) if not tasks or _task(store) in tasks]
     else:
         stores = _stores(selection, of_studies=True)
-        stores = [store for store in stores if (_task(store), store.path.name) in only]
-        absent = len(only) - len({(_task(store), store.path.name) for store in stores})
+        stores = [store for store in stores if (_task(store), store.name) in only]
+        absent = len(only) - len({(_task(store), store.name) for store in stores})
         if absent:
             refused.append(f"{absent} of the study's {len(only)} entries: nothing is trained yet")
     for store in stores:
         try:
-            held = read_each(store)
+            entry = read(store)
         except QrlSuiteError as error:
             refused.append(printable(error))  # names of folders are strangers' words
             continue
-        for entry in held:
+        if entry is not None:
             refused += entry.refused
-            good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
+            good.setdefault((entry.task, entry.task_hash, entry.record.name), []).append(entry)
     collected = []
-    for copies in (copies for same in good.values() for copies in told_apart(same)):
-        shown, problem = _shown(copies)
-        collected += shown
-        refused += [problem] if problem else []
+    for kinds in map(by_code, good.values()):
+        for copies in kinds if selection.all_codes else kinds[:1]:
+            shown, problem = _shown(copies)
+            beside = len(kinds) > 1 and shown[0].source == "published"
+            collected += [replace(entry, mark=BESIDE) for entry in shown] if beside else shown
+            refused += [problem] if problem else []
+        if len(kinds) > 1 and not selection.all_codes:
+            others = counted(len(kinds) - 1, "entry")
+            refused.append(
+                f"{others} of other code than '{shown[0].label}': `qrlsuite leaderboard --all-codes` shows all"
+            )
     return collected, refused
 
 
 def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
-    """Return copies of an entry in lists, one for each code that trained some."""
+    """Return copies of an entry in lists, one for each code: first the newest code with enough seeds to rank."""
     kinds: list[list[EntryResults]] = []
     for entry in copies:
         same = next((kind for kind in kinds if kind[0].has_code_of(entry)), None)
@@ -132,24 +149,12 @@ def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
             kinds.append([entry])
         else:
             same.append(entry)
-    return kinds
+    return sorted(kinds, key=_newness, reverse=True)
 
 
-def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
-    """Return copies of an entry by code, each with its mark if there are several codes.
-
-    If all own seeds have one code and all published seeds another, the published copy is marked as published.
-    """
-    kinds = by_code(copies)
-    if len(kinds) == 1:
-        return kinds
-    own = [same for same in kinds if any(entry.source == "runs" for entry in same)]
-    if len(own) == 1 and len(kinds) == 2:
-        return [*own, *([each.marked(BESIDE) for each in same] for same in kinds if same is not own[0])]
-    return [
-        [entry.marked("@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in same]
-        for same in kinds
-    ]
+def _newness(kind: Sequence[EntryResults]) -> tuple[bool, str, int]:
+    seeds = {seed for entry in kind for seed in entry.seeds}
+    return len(seeds) >= MIN_RUNS, max(entry.trained for entry in kind), len(seeds)
 
 
 def select(
@@ -256,17 +261,16 @@ def best(copies: Iterable[EntryResults]) -> EntryResults:
 def united(copies: Sequence[EntryResults]) -> tuple[EntryResults, str]:
     """Return the union of an entry's copies, or the best copy if they differ; and the reason why some are left out.
 
-    Copies of another code are left out, and shorter copies within the task's shortest horizon.
+    Shorter copies within the task's shortest horizon are left out.
     """
     further = best(copies)
     far = _weight(further)[0]
-    same = [copy for copy in copies if copy.mark == further.mark]
     shown = f"{_size(further)} of the same entry, from {further.folder}"
     try:
-        whole = functools.reduce(operator.add, [copy for copy in same if _weight(copy)[0] == far])
+        whole = functools.reduce(operator.add, [copy for copy in copies if _weight(copy)[0] == far])
     except DifferentCurvesError as error:
         return further, f"{error}; shown are {shown}"
-    shorter = [copy for copy in same if copy.source == "published" and _weight(copy)[0] < far]
+    shorter = [copy for copy in copies if copy.source == "published" and _weight(copy)[0] < far]
     return whole, "; ".join(f"{copy.folder}: {_size(copy)}; shown are {shown}" for copy in shorter)
 
 
@@ -275,22 +279,8 @@ def _size(entry: EntryResults) -> str:
 
 
 def read_copies(selection: Selection, name: str) -> list[EntryResults]:
-    """Read the copies of the entry that has a name, see `find`; `NAME @MARK` names its seeds of one code."""
-    try:
-        found, mark = _every_copy(selection, name), ""
-    except UnknownNameError:
-        base, at, mark = name.rpartition("@")
-        if not at:
-            raise
-        found = _every_copy(selection, base.rstrip())
-    told = told_apart(found)
-    if not mark and len(told) == 2 and told[1][0].name.endswith(BESIDE):
-        return [copy for copies in told for copy in copies]
-    meant = [copies for copies in told if not mark or copies[0].name.rpartition("@")[2].startswith(mark)]
-    if len(meant) != 1:
-        labels = listed([f"'{copies[0].label}'" for copies in told])
-        raise UnknownNameError(f"'{name}' has seeds of {len(told)} codes: write {labels}")
-    return meant[0]
+    """Read the copies of the entry that has a name, see `find`: of several codes, those of the first of `by_code`."""
+    return by_code(_every_copy(selection, name))[0]
 
 
 def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
@@ -306,7 +296,7 @@ def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
         place = f"{selection.runs}, {selection.of_tasks.removeprefix(' of ')}" if tasks else selection.runs
         key = lookup.choose(list({e.key: e for e in meant}.values()), name, place).key
         folders = [entry.store for entry in everything if entry.key == key]
-    copies = [entry for store in folders for entry in read_each(store)]
+    copies = [entry for store in folders if (entry := read(store)) is not None]
     if not copies:
         if any(min(store.seeds(), default=0) >= TUNING_SEEDS for store in folders):
             raise UnknownNameError(
@@ -325,7 +315,7 @@ def _shown(copies: Sequence[EntryResults]) -> tuple[list[EntryResults], str]:
     """Return the shown copies of an entry, see `united`; and shorter own copies beside them."""
     whole, problem = united(copies)
     shorter = [copy for copy in copies if copy.source == "runs" and _weight(copy)[0] < _weight(whole)[0]]
-    return [*shorter, whole.marked(BESIDE) if shorter else whole], problem
+    return [*shorter, replace(whole, mark=BESIDE) if shorter else whole], problem
 
 
 def _weight(entry: EntryResults) -> tuple[int, int, int]:
@@ -363,43 +353,19 @@ def _task(store: EntryStore) -> str:
 
 def read(store: EntryStore) -> EntryResults | None:
     """Read one entry, from runs or published; None where no run has finished an epoch."""
-    found = read_each(store)
-    if len(found) > 1:
-        labels = listed([f"'{entry.label}'" for entry in found])
-        raise StoreError(f"{store.path} has seeds of several codes, which are several entries: {labels}")
-    return found[0] if found else None
-
-
-def read_each(store: EntryStore) -> list[EntryResults]:
-    """Read a folder's entry, from runs or published; nothing where no run has finished an epoch.
-
-    Seeds of several codes are as many entries.
-    """
     if published_entries.is_published(store.path):
         known = published_entries.comes_with_suite(store.path)
-        return [published_entries.read(store.path, label=not known).entry_results()]
-    groups = codes.of_seeds(store)
-    found = [_of_code(store, group) for group in groups] if len(groups) > 1 else [read_entry(store)]
-    return [entry for entry in found if entry is not None]
+        return published_entries.read(store.path, label=not known).entry_results()
+    return read_entry(store)
 
 
-def _of_code(store: EntryStore, group: codes.SameCode) -> EntryResults | None:
-    entry = read_entry(store, group.seeds)
-    return None if entry is None else entry.marked(f"@{group.mark}")
-
-
-def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryResults | None:
+def read_entry(store: EntryStore) -> EntryResults | None:
     """Read one entry from its runs; None if no run has finished an epoch. Tuning seeds do not count.
 
-    A seed with a damaged file, or in the wrong folder, is left out; other seeds are read.
-
-    Parameters
-    ----------
-    seeds:
-        The only seeds to read; None for all.
+    A seed with a damaged file, in the wrong folder, or of other code is left out; other seeds are read.
     """
     record = store.record()
-    runs, refused = _readable(store, current(record), seeds)
+    runs, refused = _readable(store, current(record))
     if not runs:
         if refused:
             raise StoreError("; ".join(refused))
@@ -415,19 +381,19 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
     )
 
 
-def _readable(
-    store: EntryStore, task_file: TaskFile, chosen: Collection[int] | None
-) -> tuple[list[SeedRun], list[str]]:
+def _readable(store: EntryStore, task_file: TaskFile) -> tuple[list[SeedRun], list[str]]:
     """Return the runs with an epoch or more, and one line for each seed that does not count and why."""
     runs: dict[int, SeedRun] = {}
-    refused = []
+    refused, held = [], codes.of(store)
     for seed in store.seeds():
-        if seed >= TUNING_SEEDS or (chosen is not None and seed not in chosen):
+        if seed >= TUNING_SEEDS:
             continue
         try:
             run = store.seed(seed).read()
             if len(run.scores):
                 require_scores(run.curve, task_file, store.seed(seed).path)
+                if held is not None and run.record is not None and run.record.code_identity not in held:
+                    raise StoreError(f"{run.folder} has it of another code than that of its first seed")
         except StoreError as error:
             refused.append(f"seed {seed}: {printable(error)}")
             continue

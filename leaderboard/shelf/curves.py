@@ -57,7 +57,7 @@ class EntryResults(Shown):
     folder:
         Folder of its files; for a sum, the folder of the results with more seeds.
     mark:
-        Text behind its name where seeds of one name are shown apart.
+        Text behind its name where another code has the name alone.
     refused:
         One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
     chosen_seeds:
@@ -112,8 +112,9 @@ class EntryResults(Shown):
         )
 
     def has_code_of(self, other: EntryResults) -> bool:
-        """Return whether the seeds of both were trained by the same code, or by code that was declared to be."""
-        return self.codes == other.codes or bool(set(self.codes) & set(other.codes))
+        """Return whether the seeds of both were trained by the same code, or by codes that `--same` links."""
+        here, there = (codes.linked(each.record, each.codes) for each in (self, other))
+        return self.codes == other.codes or bool(set(here) & set(there))
 
     @property
     def name(self) -> str:
@@ -313,9 +314,10 @@ class EntryResults(Shown):
         """Marks of the contents of plugins by path that trained its seeds, by file name."""
         return codes.contents(self.record, self.codes)
 
-    def marked(self, mark: str) -> EntryResults:
-        """Return the entry with a mark behind its name and its label, unless it has one."""
-        return self if self.mark else replace(self, mark=mark)
+    @property
+    def trained(self) -> str:
+        """When the newest of its epochs ended, in UTC; empty if not recorded."""
+        return max((run.time for run in self.records.values()), default="")
 
     def labeled(self, label: str) -> EntryResults:
         """Return the entry with a label of your own, for pictures and tables."""
@@ -524,7 +526,7 @@ def edited_between(first: EntryResults, second: EntryResults) -> str:
         return ""
     return (
         f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
-        f"'{second.label}': their scores cannot be compared; train the one of the earlier code again with --fresh"
+        f"'{second.label}': their scores cannot be compared; train the one of the earlier code again"
     )
 
 

@@ -49,7 +49,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
             f"'{entry.label}' begins with the agents of another entry, so nobody could train its seeds again from what "
             "is published: it cannot be exported"
         )
-    codes.require_installed(store, entry.seeds, identity.of(built))
+    codes.require_installed(store, identity.of(built))
     record = store.record()
     run = {name: value for name, value in record.content.items() if name not in ("published", "code")}
     folder = out / entry.task / built.name

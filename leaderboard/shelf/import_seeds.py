@@ -112,19 +112,24 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
             f"{source.path} belongs to a study with looks, whose number of seeds depends on what they showed: it is "
             "continued by the study alone"
         )
-    store = EntryStore.find(runs, entry)
+    held = None if exported is not None else codes.of(source)
+    code = exported.record.code_identity if exported is not None else None if held is None else held.first
+    store = codes.place(runs, entry, code)
     if store.path.resolve() == source.path.resolve():
         raise StoreError(f"{source.path} is in {runs} itself: there is nothing to import")
     _require_same_task(entry, source, runs)
-    held = sorted(exported.seeds if exported is not None else source.seeds())
-    seeds = [seed for seed in held if seed < TUNING_SEEDS]
+    every = sorted(exported.seeds if exported is not None else source.seeds())
+    seeds = [seed for seed in every if seed < TUNING_SEEDS]
     if not seeds:
         raise StoreError(f"{source.path} holds no seed")
     runs_by_seed = {seed: source.seed(seed).read() for seed in seeds} if exported is None else {}
     for run in runs_by_seed.values():  # all of them, before anything is written
         require_scores(run.curve, entry.task.file, source.seed(run.seed).path)
     agents = {} if exported is None else exported.parameters()
-    store = EntryStore.create(runs, entry, _place_for(store, source, exported is not None, runs, entry))
+    store = EntryStore.create(runs, entry, store.mark)
+    record, links = store.record(), source.record().same
+    if more := [link for link in links if link not in record.same]:
+        store.write_record(record.changed(same=[*record.same, *more]))
     claim = acquire(store, seeds)
     try:
         offered = _of_runs(source, runs_by_seed) if exported is None else _of_export(exported, agents, entry)
@@ -139,24 +144,13 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
                 notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
             if without := sorted(set(new) - set(agents)):
                 notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
-        if (plugins := identity.plugins(entry)) and not codes.others(store, code := identity.of(entry)):
-            codes.prepare(store, code, plugins)
+        now, kept = identity.of(entry), codes.of(store)
+        if (plugins := identity.plugins(entry)) and (kept is None or now in kept):
+            codes.prepare(store, now, plugins)
         label = f"{entry.label} {store.mark}".rstrip()
         return Imported(store, entry.name, label, entry.task.name, tuple(new), tuple(known), tuple(notes))
     finally:
         claim.release()
-
-
-def _place_for(store: EntryStore, source: EntryStore, exported: bool, runs: Path, entry: Entry) -> str:
-    """Return the mark of the seeds' folder: empty if seeds of their code are there, else their own mark."""
-    try:
-        codes.require_mergeable(store, source, exported)
-    except codes.ChangedCodeError:
-        if not source.mark:
-            raise
-        codes.require_mergeable(EntryStore.find(runs, entry, source.mark), source, exported)
-        return source.mark
-    return ""
 
 
 def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:

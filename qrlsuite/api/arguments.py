@@ -12,16 +12,14 @@ Seeds = int | str | Iterable[int]
 """100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
 
 
-def where_of(
-    engine: str | Where, workers: int | None, device: str, fresh: bool = False, same: str | None = None
-) -> Where:
+def where_of(engine: str | Where, workers: int | None, device: str, same: str | None = None) -> Where:
     """Return where training is done."""
     if isinstance(engine, Where):
         if workers is not None or device != "cpu":
             raise OptionError("workers and device belong to an engine that is built already: give them there")
-        return replace(engine, fresh=engine.fresh or fresh, same=engine.same if same is None else same)
+        return replace(engine, same=engine.same if same is None else same)
     check_positive("workers", workers)
-    return replace(Where.create(engine, workers, device=device), fresh=fresh, same=same)
+    return replace(Where.create(engine, workers, device=device), same=same)
 
 
 def check_positive(name: str, value: int | None) -> None:

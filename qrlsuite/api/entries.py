@@ -82,6 +82,7 @@ def board(
     horizon: int | None = None,
     entries: Sequence[str | EntryResults] = (),
     study: str | None = None,
+    all_codes: bool = False,
 ) -> Leaderboard:
     """Rank entries by significant outperformance: on a task, on each task, or over several tasks together.
 
@@ -112,6 +113,8 @@ def board(
         budget.
     study:
         Rank the entries of this study only: its name, or a study file's path.
+    all_codes:
+        Show entries of every code, and not only of the newest code with 20 seeds or more.
 
     Returns
     -------
@@ -140,7 +143,7 @@ def board(
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
-    written = Selection.create(runs, task, published)
+    written = Selection.create(runs, task, published, all_codes)
     selection = written.named()
     together = selection.tasks if len(selection.tasks) > 1 else ()
     if rule is not None and (together or by != "steps"):
@@ -202,7 +205,12 @@ def write_page(
     from qrlsuite.leaderboard.shelf import published_studies
 
     tasks, runs = written.tasks, written.runs
-    asked |= {"runs": runs, "published": written.published, "study": study}
+    asked |= {
+        "runs": runs,
+        "published": written.published,
+        "all_codes": written.all_codes,
+        "study": study,
+    }
     beside = None if len(tasks) < 2 and by == "steps" else board(tasks, by=by, **asked)
     shown = [board(names, **asked) for names in [[task] for task in tasks] or [[]]]
     sections = tuple(section for one in shown for section in one.sections)
@@ -286,7 +294,13 @@ def compare(
     among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
     places = (f"of the same entry, from {left.folder}", f"of the same entry, from {other.folder}")
     copies = [f"left out: {line}" for line in left_out if line.endswith(places)]
-    return replace(compared, among=among, remarks=(*compared.remarks, *copies))
+    newer = [
+        f"'{shown.label}' is the same entry as '{mine.label}', of newer code"
+        for mine in (left, other)
+        for shown in others
+        if shown.record.hash == mine.record.hash and not shown.has_code_of(mine)
+    ]
+    return replace(compared, among=among, remarks=(*compared.remarks, *copies, *newer))
 
 
 def plot(

@@ -218,7 +218,7 @@ def _codes_of_seeds(store: EntryStore) -> dict[str, list[str]]:
         made = published_entries.read(store.path)
         code = made.record.code_identity
         return {format_seeds(made.seeds): ["not recorded" if code is None else code.digest]}
-    return {
-        format_seeds(group.seeds): [digest or "not recorded" for digest in group.codes]
-        for group in codes.of_seeds(store)
-    }
+    held = codes.of(store)
+    if held is None:
+        return {}
+    return {format_seeds(store.seeds()): [digest or "not recorded" for digest in held.digests]}

@@ -179,7 +179,6 @@ def run_study(
     engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
-    fresh: bool = False,
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
@@ -203,7 +202,7 @@ def run_study(
         `epochs`, only for a study without looks.
     seeds, epochs:
         As for `train`; None takes each task's protocol.
-    budget, engine, workers, device, fresh, same, runs, progress:
+    budget, engine, workers, device, same, runs, progress:
         As for `train`.
 
     Returns
@@ -227,11 +226,11 @@ def run_study(
     >>> run_study("fig6", seeds=20, budget="30min")  # doctest: +SKIP
     """
     check_positive("epochs", epochs)
-    where = where_of(engine, workers, device, fresh, same)
+    where = where_of(engine, workers, device, same)
     study = studies.find(name)
     chosen = {"options": options, "models": models, "only": only, "--seeds": seeds, "--epochs": epochs}
     if study.file.looks is not None:
-        require_unchanged(name, chosen | {"--fresh": fresh})
+        require_unchanged(name, chosen)
         return take_looks(study, where, budget, runs, progress)
     [planned], _ = plan(name, options, models, several(only), seeds, epochs, where, runs)
     [done] = train_studies([planned], where, budget, progress)
@@ -290,7 +289,7 @@ def train_studies(
     console = Console(stderr=True, quiet=not progress, highlight=False, soft_wrap=True, markup=False)
     missing.check_budget(budget, where)
     works, began = [work for each in planned for work in each.works], time.monotonic()
-    missing.require_same_code(works[0].runs, [work.entry for work in works], where, quiet=not progress)
+    missing.places(works[0].runs, [work.entry for work in works], where, quiet=not progress)
     for each in planned:
         if len(planned) > 1:
             console.print(f"\nstudy {each.study.name}: {each.study.file.summary}")

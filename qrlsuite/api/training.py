@@ -47,7 +47,6 @@ def train(
     device: str = "cpu",
     budget: str | None = None,
     track: str | Sequence[str] = (),
-    fresh: bool = False,
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
@@ -85,10 +84,9 @@ def train(
         `"30min"`, `"8h"` or `"2core-hours"`: stop then, with every finished epoch saved.
     track:
         Trackers that watch, `NAME` or `NAME=TARGET`.
-    fresh:
-        Where the code of the entry has changed: train anew, and move the old seeds to a folder beside it.
     same:
-        Where the code has changed: your word that nothing changed in effect, as a reason; the seeds are continued.
+        Where the code has changed: your word that nothing changed in effect, as a reason; the old seeds are continued.
+        Without it, seeds of the changed code are another entry, with a mark such as `@1a2b3c4d` behind its name.
     runs:
         The results folder.
     progress:
@@ -105,7 +103,7 @@ def train(
     UnknownNameError, OptionError, FileError
         For an unknown name, or an option or argument that cannot be used.
     StoreError
-        If a file of the entry is damaged, or another code has begun its seeds.
+        If a file of the entry is damaged, or `same` is given and the old seeds cannot be continued.
     QrlSuiteError
         If training failed; finished epochs are kept.
     KeyboardInterrupt
@@ -118,7 +116,7 @@ def train(
     (2, 1)
     """
     entry = resolve_entry(task, model, algorithm, from_mapping(options), preset, runs)
-    where = where_of(engine, workers, device, fresh, same)
+    where = where_of(engine, workers, device, same)
     work, submitted = train_entry(entry, where, seeds, epochs, budget, track, runs, progress, start=start)
     if submitted is not None and progress:
         print(submitted, file=sys.stderr)
@@ -175,13 +173,16 @@ def train_entry(
     folder, quiet = Path(runs), not progress
     seed_numbers = None if seeds is None else read_seeds(seeds)
     check_positive("epochs", epochs)
+    put_agents = None
     if start is not None:
         from qrlsuite.api.warm import begin_with  # torch
 
-        entry = begin_with(entry, folder, start, seed_numbers)
+        entry, put_agents = begin_with(entry, folder, start, seed_numbers)
     missing.check_budget(budget, where)
-    [code] = missing.require_same_code(folder, [entry], where, quiet)
-    work = missing.find(folder, entry, where, seed_numbers, epochs)
+    [(store, code)] = missing.places(folder, [entry], where, quiet)
+    if put_agents is not None:
+        put_agents(store)
+    work = missing.find(folder, entry, where, seed_numbers, epochs, store)
     if work.groups:
         missing.require_trainable([entry], where)
     display = RunDisplay(work, where.workers, quiet)
@@ -208,7 +209,6 @@ def tune(
     engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
-    fresh: bool = False,
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
@@ -219,7 +219,7 @@ def tune(
 
     Parameters
     ----------
-    task, engine, workers, device, fresh, same, runs:
+    task, engine, workers, device, same, runs:
         As for `train`. Trials lie below `runs`/tuning.
     entries:
         Entries to tune: `"mlp width=16"`, or several, which get equal budgets. Their written options are not varied.
@@ -266,7 +266,7 @@ def tune(
     >>> small, circuit = tune("beam6g", ["mlp width=16", "vqc-native qubits=6"])  # doctest: +SKIP
     >>> entry = train("beam6g", f"mlp preset={small.written}")  # doctest: +SKIP
     """
-    where, folder = where_of(engine, workers, device, fresh, same), Path(runs)
+    where, folder = where_of(engine, workers, device, same), Path(runs)
     check_positive("epochs", epochs)
     requests = read_requests(task, several(entries), vary or (), sampler, seeds, epochs, objective, budget)
     path = preset_path(out, requests)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +18,10 @@ from qrlsuite.training import evaluation
 from qrlsuite.training.trainer import Trainer
 
 
-def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None = None) -> Entry:
-    """Return an entry whose seeds begin with trained agents, which are put into its folder: seed k with seed k's agent.
+def begin_with(
+    entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None = None
+) -> tuple[Entry, Callable[[EntryStore], None]]:
+    """Return an entry whose seeds begin with trained agents, seed k with seed k's; and what puts them into its folder.
 
     Parameters
     ----------
@@ -35,9 +37,9 @@ def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None 
     UnknownNameError
         If no entry, or several, have the name.
     StoreError
-        If it has no agents, they have other parameters than the model, or a file cannot be written.
+        If it has no agents, or they have other parameters than the model.
     OptionError
-        If a seed has no agent, or the algorithm cannot begin with agents.
+        If the algorithm cannot begin with agents.
     """
     source = find(Selection(runs, True, (entry.task.name,)), name)
     agents, _, _ = evaluation.best_runs(source, max(1, len(source.seeds())))
@@ -47,19 +49,22 @@ def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None 
     epochs = first.trained_epochs()
     start = f"{trained.task.name}/{trained.name}{source.mark}:{epochs}"
     begun = replace(entry, start=start)
-    store = EntryStore.find(runs, begun)
-    requested = range(entry.task.file.protocol.seeds) if seeds is None else seeds
-    wanted = [seed for seed in requested if not store.start_of(seed).exists()]
-    if absent := sorted(set(wanted) - set(agents)):
-        there = format_seeds(sorted(agents))
-        raise OptionError(
-            f"--from: '{start}' has the agents of seeds {there}, and none for {format_seeds(absent)}: --seeds {there}"
-        )
-    if wanted:
-        EntryStore.create(runs, begun)
-    for seed in wanted:
-        write_atomically(store.start_of(seed), encode(source.seed(seed).parameters()))
-    return begun
+
+    def put(store: EntryStore) -> None:
+        requested = range(entry.task.file.protocol.seeds) if seeds is None else seeds
+        wanted = [seed for seed in requested if not store.start_of(seed).exists()]
+        if absent := sorted(set(wanted) - set(agents)):
+            there = format_seeds(sorted(agents))
+            raise OptionError(
+                f"--from: '{start}' has the agents of seeds {there}, and none for {format_seeds(absent)}: "
+                f"--seeds {there}"
+            )
+        if wanted:
+            EntryStore.create(runs, begun, store.mark)
+        for seed in wanted:
+            write_atomically(store.start_of(seed), encode(source.seed(seed).parameters()))
+
+    return begun, put
 
 
 def _require_fit(entry: Entry, seed: int, agent: Arrays, path: Path) -> None:

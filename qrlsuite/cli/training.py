@@ -39,18 +39,11 @@ DeviceOption = Annotated[
     str, typer.Option("--device", help="Where networks are trained: cpu, cuda or cuda:1.")
 ]
 
-FreshOption = Annotated[
-    bool,
-    typer.Option(
-        "--fresh",
-        help="Where the code of an entry has changed: train anew, and move the old seeds to a folder beside it.",
-    ),
-]
 SameOption = Annotated[
     str | None,
     typer.Option(
         "--same",
         metavar="REASON",
-        help="Where the code has changed: your word that nothing changed in effect; the seeds are continued.",
+        help="Where the code has changed: your word that nothing changed in effect; the old seeds are continued.",
     ),
 ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import socket
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,16 +17,16 @@ from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import EngineOutcome, Missing, Snapshot, raise_failures
-from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.identity import CodeIdentity
-from qrlsuite.results import codes, probes, speed
+from qrlsuite.results import checkpoint, codes, probes, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
-from qrlsuite.results.seeds import SeedGroup, plan_groups
+from qrlsuite.results.seeds import SeedGroup, format_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
-from qrlsuite.results.text import duration_range
+from qrlsuite.results.text import counted, duration_range
 from qrlsuite.statistics.curves import reached
 from qrlsuite.training import device as devices
 from qrlsuite.training import memory
@@ -39,6 +38,7 @@ def find(
     where: Where,
     seeds: Sequence[int] | None = None,
     epochs: int | None = None,
+    store: EntryStore | None = None,
 ) -> Missing:
     """Find an entry's missing seeds in a results folder; writes nothing.
 
@@ -46,10 +46,12 @@ def find(
     ----------
     seeds, epochs:
         None takes the task's protocol.
+    store:
+        The entry's folder, where `places` has just returned it.
     """
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
-    store = EntryStore.find(runs, entry)
+    store = store or codes.place(runs, entry, identity.of(entry))
     busy = {seed for claim in certain(store) for seed in claim.seeds} | where.engine.queued(store)
     busy &= set(requested)
     left = sorted(set(requested) - busy)
@@ -57,33 +59,64 @@ def find(
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
 
 
-def require_same_code(
+def places(
     runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False
-) -> list[CodeIdentity]:
-    """Return the entries' code; refuse an entry if other code has begun its seeds, before anything is planned.
+) -> list[tuple[EntryStore, CodeIdentity]]:
+    """Return the folder and the code of each entry, before anything is planned.
 
-    With `where.fresh`, such seeds are set aside, with a line unless `quiet`; with `where.same`, the codes are
-    declared to be equal in effect.
+    Where earlier seeds are of another code, one line says so unless `quiet`; the seeds of a study with looks are
+    refused then. With `where.same` they are continued: the codes are linked, once a checkpoint was loaded.
     """
-    if where.fresh and where.same is not None:
+    reason = where.same
+    if reason is not None and (not reason.strip() or not reason.isprintable()):
         raise OptionError(
-            "--fresh and --same: the old seeds are either set aside or continued; give one of them"
+            "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
         )
-    console = Console(stderr=True, quiet=quiet, highlight=False)
-    computed = [identity.of(entry) for entry in entries]
-    for entry, code in zip(entries, computed):
-        store = EntryStore.find(runs, entry)
-        if where.same is not None:
-            codes.declare_same(store, code, where.same)
-        elif where.fresh:
-            old, earlier = codes.set_aside(runs, store, code, where.engine.queued(store))
-            moved = [] if old is None else [f"the seeds of another code are now in {old}"]
-            moved += [] if earlier is None else [f"{earlier} has seeds of this code: they are continued"]
-            for line in moved:
-                console.print(line, markup=False, soft_wrap=True)
-        else:
-            codes.require(store, code)
-    return computed
+    found, anew = [], list[str]()
+    for entry in entries:
+        code = identity.of(entry)
+        store = codes.place(runs, entry, code)
+        before = codes.other(runs, entry, code)
+        held = None if before is None else codes.of(before)
+        if before is not None and held is not None:
+            seeds = (
+                f"{before.path} has seeds {format_seeds(before.seeds())} of another code: {held.change(code)}"
+            )
+            if reason is not None:
+                _require_loadable(entry, before)
+                codes.link(before, code, reason)
+                store = before
+            elif entry.plan is not None:
+                raise codes.ChangedCodeError(
+                    f'{seeds}. Nothing was trained. Restore that code, or write another study; and --same "REASON" '
+                    "says that nothing changed in effect"
+                )
+            elif codes.of(store) is None:
+                anew.append(
+                    f"{seeds}. Begun anew is '{entry.label} {store.mark}'; --same \"REASON\" continues the old seeds, "
+                    "if nothing changed in effect"
+                )
+        found.append((store, code))
+    if anew:
+        more = f" (and so for {counted(len(anew) - 1, 'more entry')})" if len(anew) > 1 else ""
+        console = Console(stderr=True, quiet=quiet, highlight=False)
+        console.print(f"{anew[0]}{more}", markup=False, soft_wrap=True)
+    return found
+
+
+def _require_loadable(entry: Entry, store: EntryStore) -> None:
+    """Load a checkpoint of an entry's seeds with the code that is installed."""
+    from qrlsuite.training.trainer import Trainer  # imports torch
+
+    if not (newest := checkpoint.latest(store)):
+        return
+    seed = min(newest)
+    try:
+        Trainer(entry, [seed]).restore(*checkpoint.load(store, [seed]))
+    except QrlSuiteError as error:
+        raise StoreError(
+            f"--same: {store.path} cannot be continued: loading the checkpoint of seed {seed} fails: {error}"
+        ) from error
 
 
 def require_trainable(entries: Sequence[Entry], where: Where) -> None:
@@ -134,7 +167,7 @@ def train(
     confirmed:
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
     code:
-        The entry's, where `require_same_code` has just returned it; None computes it and refuses another one.
+        The entry's, where `places` has just returned it.
     began:
         When the budget began, by `time.monotonic`; None is now.
     """
@@ -150,18 +183,13 @@ def train(
     if work.entry.start is not None:  # what is missing is said before anything is trained
         work.store.initial([seed for group in work.groups if group.epoch == 0 for seed in group.seeds])
     display.deadline = None if limit is None else began + limit
-    if code is None:
-        code = identity.of(work.entry)
-        codes.require(work.store, code)
-    if certain(work.store):  # somebody has begun it, and maybe no seed says so yet
-        codes.require_sent(work.store, code, socket.gethostname())
     if not where.remote and work.groups:
         _check_device(where.device)
         check_memory(work, where)
     fresh = not work.store.path.exists()
-    EntryStore.create(work.runs, work.entry)
+    EntryStore.create(work.runs, work.entry, work.store.mark)
     if work.groups:
-        codes.prepare(work.store, code, identity.plugins(work.entry))
+        codes.prepare(work.store, code or identity.of(work.entry), identity.plugins(work.entry))
     holders = sorted({f"process {claim.pid} on {claim.host}" for claim in certain(work.store)})
     display.begin(where.submits, holders)
     if not work.groups:

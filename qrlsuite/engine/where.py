@@ -30,8 +30,6 @@ class Where:
         The engine's name, for messages.
     remote:
         Whether groups run on other machines than this one.
-    fresh:
-        Whether an entry whose code has changed is begun anew, and its old seeds set aside.
     same:
         Its author's word that a change of code changes nothing: the reason.
     """
@@ -42,7 +40,6 @@ class Where:
     submits: bool = False
     name: str = "local"
     remote: bool = False
-    fresh: bool = False
     same: str | None = None
 
     @classmethod

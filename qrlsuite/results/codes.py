@@ -1,27 +1,28 @@
-"""The code identities of an entry's seeds: which seeds make one entry, and the ways on after the code has changed.
+"""The code that an entry's seeds are of, which is part of the entry's name, and the copies of plugins in its folder.
 
 Under `code`, `run.json` has the identity of the code that began the seed, and `entry.json` that of the code that trains
-now. Older seeds have no identity: they have the suite's first bits, or unknown code of a plugin. Codes
-that an author declared to be equal in effect stand in `entry.json` under `same`.
+now. A folder is of the code of its first seed, and of codes that `--same` links to it (`same` in `entry.json`). Seeds
+of other code lie beside it, in `NAME@1a2b3c4d`. Older seeds have no identity: they have the suite's first bits, or
+unknown code of a plugin.
 """
 
 from __future__ import annotations
 
 import datetime
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from qrlsuite import own
-from qrlsuite.errors import OptionError, PluginError, StoreError, listed
+from qrlsuite.errors import PluginError, StoreError, listed
 from qrlsuite.experiment import identity
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.identity import CodeIdentity
-from qrlsuite.results import genuine, survey
-from qrlsuite.results.claims import move_away
+from qrlsuite.results import genuine
+from qrlsuite.results.claims import certain
 from qrlsuite.results.records import PLUGINS, EntryRecord
-from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, copies_of_plugins
 
 UNKNOWN = ""
@@ -33,22 +34,88 @@ class ChangedCodeError(StoreError):
 
 
 @dataclass(frozen=True)
-class SameCode:
-    """Seeds of one code, or of several codes that were declared to be equal in effect.
+class CodeOfFolder:
+    """The code that the seeds of an entry's folder are of.
 
     Attributes
     ----------
-    codes:
-        Identities by digest, in the order of the seeds; None if no identity was recorded.
+    first:
+        The identity of its first seed's code; None if it was not recorded.
+    digests:
+        Of this code, and of those that `--same` links to it.
     """
 
-    seeds: tuple[int, ...]
-    codes: Mapping[str, CodeIdentity | None]
+    first: CodeIdentity | None
+    digests: tuple[str, ...]
 
-    @property
-    def mark(self) -> str:
-        """Eight digits that identify the code of these seeds; zeros if it is unknown."""
-        return next(filter(None, self.codes), "0" * 8)[:8]
+    def __contains__(self, code: CodeIdentity | None) -> bool:
+        if code is not None and self.first is not None:
+            return code.digest in self.digests
+        # seeds without an identity may have the suite's first bits
+        original = all(each.original for each in (code, self.first) if each is not None)
+        return original or (UNKNOWN if code is None else code.digest) in self.digests
+
+    def change(self, current: CodeIdentity) -> str:
+        """Say how another code differs from it."""
+        before = self.first
+        if before is None and all("numerics" in part or part["role"] == "file" for part in current.parts):
+            before = CodeIdentity(
+                tuple({**part, **({"numerics": 1} if "numerics" in part else {})} for part in current.parts)
+            )
+        if before is None:
+            return "begun before the code of plugins was recorded, so nobody knows whether it is the same"
+        return listed(identity.differences(before.parts, current.parts))
+
+
+def of(store: EntryStore) -> CodeOfFolder | None:
+    """Return the code of an entry's folder; None without a seed.
+
+    A seed without a finished epoch does not count: any code may begin it anew.
+    """
+    for seed in store.seeds() if (store.path / "entry.json").exists() else ():
+        folder = store.seed(seed)
+        try:
+            record = folder.record()
+        except StoreError:  # is said where the seed is read
+            continue
+        if record is not None and (record.epochs or folder.lines.exists() or folder.table.exists()):
+            digest = UNKNOWN if record.code is None else record.code.digest
+            return CodeOfFolder(record.code_identity, linked(store.record(), [digest]))
+    return None
+
+
+def linked(record: EntryRecord, digests: Iterable[str]) -> tuple[str, ...]:
+    """Return digests of codes, and those that `--same` links to them."""
+    found = dict.fromkeys(digests)
+    for link in record.same_codes:
+        if not found.keys().isdisjoint(link):
+            found |= dict.fromkeys(link)
+    return tuple(found)
+
+
+def place(runs: Path, entry: Entry, code: CodeIdentity | None) -> EntryStore:
+    """Return the folder of an entry's seeds of one code, existing or not.
+
+    The first code has the entry's name, another one a mark behind it.
+    """
+    stores = EntryStore.of_name(runs, entry)
+    found = next((store for store in stores if _may_train(store, code)), None)
+    mark = f"@{'0' * 8 if code is None else code.digest[:8]}"
+    return found or EntryStore.find(runs, entry, mark if stores else "")
+
+
+def _may_train(store: EntryStore, code: CodeIdentity | None) -> bool:
+    """Return whether a folder is of a code; one without a seed is of any code, unless somebody begins it now."""
+    if (held := of(store)) is not None:
+        return code in held
+    return not certain(store) or store.record().code_identity in (None, code)
+
+
+def other(runs: Path, entry: Entry, code: CodeIdentity) -> EntryStore | None:
+    """Return the folder of an entry's seeds of another code, the newest of several; None without one."""
+    others = {store: held for store in EntryStore.of_name(runs, entry) if (held := of(store)) is not None}
+    others = {store: held for store, held in others.items() if code not in held}
+    return max(others, key=lambda store: store.trained, default=None)
 
 
 def distinct(codes: Iterable[CodeIdentity | None]) -> tuple[str, ...]:
@@ -69,147 +136,31 @@ def environments(codes: Iterable[CodeIdentity | None]) -> frozenset[str]:
     )
 
 
-def of_seeds(store: EntryStore) -> list[SameCode]:
-    """Return an entry's seeds by their code; the code of the lowest seed comes first.
-
-    A seed without a finished epoch is left out: any code may begin it anew.
-    """
-    seeds: dict[str, list[int]] = {}
-    codes: dict[str, CodeIdentity | None] = {}
-    for seed in store.seeds() if store.path.is_dir() else ():
-        folder = store.seed(seed)
-        try:
-            record = folder.record()
-        except StoreError:  # is said where the seed is read
-            continue
-        if record is None or not (record.epochs or folder.lines.exists() or folder.table.exists()):
-            continue
-        digest = UNKNOWN if record.code is None else record.code.digest
-        codes[digest] = record.code_identity
-        seeds.setdefault(digest, []).append(seed)
-    return [
-        SameCode(
-            tuple(sorted(seed for digest in alike for seed in seeds[digest])),
-            {digest: codes[digest] for digest in alike},
-        )
-        for alike in _alike(codes, store.record().same_codes if len(codes) > 1 else [])
-    ]
-
-
-def _alike(codes: Mapping[str, CodeIdentity | None], declared: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Group digests of equal code, in their order."""
-    first = next((digest for digest, code in codes.items() if code is not None and code.original), None)
-    links = [*declared, *([[UNKNOWN, first]] if first is not None and UNKNOWN in codes else [])]
-    groups: list[set[str]] = []
-    for link in [*([digest] for digest in codes), *links]:
-        touched = [group for group in groups if group & set(link)]
-        groups = [group for group in groups if group not in touched] + [set(link).union(*touched)]
-    order = list(codes)
-    found = [[digest for digest in order if digest in group] for group in groups]
-    return sorted((group for group in found if group), key=lambda group: order.index(group[0]))
-
-
-def others(store: EntryStore, current: CodeIdentity) -> list[SameCode]:
-    """Return the seeds of an entry that another code than this one has begun."""
-    held = of_seeds(store)
-    if not held:
-        return []
-    codes = {digest: code for group in held for digest, code in group.codes.items()}
-    same = next(
-        group
-        for group in _alike({current.digest: current, **codes}, store.record().same_codes)
-        if current.digest in group
-    )
-    return [group for group in held if not set(group.codes) & set(same)]
-
-
-def require(store: EntryStore, current: CodeIdentity) -> None:
-    """Refuse to continue an entry's seeds with another code than that which began them."""
-    for group in others(store, current):
-        raise ChangedCodeError(_refusal(store, group, current))
-
-
-def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
-    seeds, record = format_seeds(group.seeds), store.record()
-    before = next(filter(None, group.codes.values()), None)
-    if before is None and all("numerics" in part or part["role"] == "file" for part in current.parts):
-        before = CodeIdentity(
-            tuple({**part, **({"numerics": 1} if "numerics" in part else {})} for part in current.parts)
-        )
-    if before is None:
-        change = (
-            "they were begun before the code of plugins was recorded, so nobody knows whether it is the same"
-        )
-    else:
-        change = listed(identity.differences(before.parts, current.parts))
-    if record.plan is None:
-        anew = (
-            f"--fresh trains anew, and the old seeds move to {store.path.name}@{group.mark}; a changed thing can be "
-            "registered under another name"
-        )
-    else:
-        anew = "Restore that code, or write another study"
-    return (
-        f"{store.path} has seeds {seeds} of '{record.label}' that another code has begun: {change}. Nothing was "
-        f'trained. {anew}; and --same "REASON" says that nothing changed in effect'
-    )
-
-
-def require_installed(store: EntryStore, seeds: Collection[int], current: CodeIdentity) -> None:
-    """Refuse to build trained agents with a plugin's code that has changed since; `numerics` do not count."""
-    for group in others(store, current):
-        for code in filter(None, group.codes.values() if set(group.seeds) & set(seeds) else ()):
-            changed = identity.differences(code.parts, current.parts, numerics=False)
-            if changed:
-                raise ChangedCodeError(
-                    f"{store.path}: seeds {format_seeds(group.seeds)} were trained by another code than is installed: "
-                    f"{listed(changed)}; install that code, or say with `qrlsuite run --same` that nothing changed"
-                    f"{copies_of_plugins(store, store.record())}"
-                )
-
-
-def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> None:
-    """Refuse to merge seeds of different code.
-
-    Parameters
-    ----------
-    store:
-        Destination of the seeds; it need not exist.
-    exported:
-        Whether `source` is an exported entry, whose record has its code.
-    """
-    groups = of_seeds(store)
-    present = {digest: code for group in groups for digest, code in group.codes.items()}
-    if exported:
-        code = source.record().code_identity
-        added: Mapping[str, CodeIdentity | None] = {UNKNOWN if code is None else code.digest: code}
-    else:
-        added = {digest: code for group in of_seeds(source) for digest, code in group.codes.items()}
-    declared = source.record().same_codes + (store.record().same_codes if groups else [])
-    alike = _alike({**present, **added}, declared)
-    if len(alike) < 2:
-        return
-    before, other = ({**present, **added}[digests[0]] for digests in alike[:2])
-    change = "of some, the code is not known"
-    if before is not None and other is not None:
-        change = listed(identity.differences(before.parts, other.parts))
-    raise ChangedCodeError(
-        f"the seeds of {source.path} are not all of one code with each other and those of {store.path}: {change}; "
-        "choose another folder with --runs"
-    )
-
-
-def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
-    """Refuse to train an entry on this machine with other code than the machine that started it has."""
-    record = store.record() if (store.path / "entry.json").exists() else None
-    sent = None if record is None else record.code_identity
-    if record is None or sent is None:
-        return
-    if len(_alike({sent.digest: sent, current.digest: current}, record.same_codes)) > 1:
+def require(store: EntryStore, current: CodeIdentity, host: str) -> None:
+    """Refuse to train a folder with other code than that of its seeds, or of the machine that started the training."""
+    sent, held = store.record().code_identity, of(store)
+    if sent is not None and sent != current:
         differing = listed(identity.differences(sent.parts, current.parts))
         raise ChangedCodeError(
             f"{host} would train {store.path} with another code than the machine that started it: {differing}; "
             "install the same on both, and repeat the command"
+        )
+    if held is not None and current not in held:
+        raise ChangedCodeError(f"{store.path} has seeds of another code: {held.change(current)}")
+
+
+def require_installed(store: EntryStore, current: CodeIdentity) -> None:
+    """Refuse to build trained agents with a plugin's code that has changed since; `numerics` do not count."""
+    held = of(store)
+    if held is None or held.first is None or current in held:
+        return
+    if changed := identity.differences(held.first.parts, current.parts, numerics=False):
+        now = store.path.with_name(f"{store.name}@{current.digest[:8]}")
+        beside = f"; {now} has seeds of the installed code" if now.is_dir() else ""
+        raise ChangedCodeError(
+            f"{store.path}: its seeds were trained by another code than is installed: {listed(changed)}; install that "
+            f"code, or say with `qrlsuite run --same` that nothing changed{beside}"
+            f"{copies_of_plugins(store, store.record())}"
         )
 
 
@@ -289,61 +240,13 @@ def load_copies(store: EntryStore) -> list[own.Loaded]:
     return [own.load_source(source) for source in sources]
 
 
-def declare_same(store: EntryStore, current: CodeIdentity, reason: str) -> None:
-    """Record the author's word that this code and the other codes of an entry's seeds are equal in effect."""
-    if not reason.strip() or not reason.isprintable():
-        raise OptionError(
-            "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
-        )
-    changed = others(store, current)
-    if not changed:
-        return
+def link(store: EntryStore, current: CodeIdentity, reason: str) -> None:
+    """Record the author's word that a code and the code of an entry's seeds are equal in effect."""
+    held = of(store)
     said = {
-        "codes": sorted({current.digest, *(digest for group in changed for digest in group.codes)}),
+        "codes": sorted({current.digest, *(() if held is None else held.digests)}),
         "reason": reason.strip(),
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
     record = store.record()
     store.write_record(record.changed(same=[*record.same, said]))
-
-
-def set_aside(
-    runs: Path, store: EntryStore, current: CodeIdentity, queued: Collection[int] = ()
-) -> tuple[Path | None, Path | None]:
-    """Move an entry's folder with seeds of another code to `<entry>@<mark>`; nothing is deleted.
-
-    A folder of this code's seeds that was set aside before takes its place.
-
-    Parameters
-    ----------
-    queued:
-        The seeds that a queue still has.
-
-    Returns
-    -------
-    tuple
-        Where the old seeds are now, and where this code's seeds were; None where there are none.
-    """
-    changed = others(store, current)
-    if not changed:
-        return None, None
-    survey.require_movable(runs, store, queued)
-    target = store.path.with_name(f"{store.path.name}@{changed[0].mark}")
-    if store.record().plan is not None:
-        raise StoreError(
-            f"{store.path} is of a study with looks that has begun: its seeds stay; write another study"
-        )
-    if len(changed) > 1 or len(of_seeds(store)) > 1:
-        seeds = format_seeds(changed[0].seeds)
-        raise StoreError(
-            f"{store.path} has seeds of several codes: move the folders of seeds {seeds} to {target} beside a copy of "
-            "entry.json, and repeat the command"
-        )
-    if target.exists():
-        raise StoreError(f"{target} is there already: move it out of {runs}, and repeat the command")
-    move_away(store, target)
-    earlier = EntryStore(store.path.with_name(f"{store.path.name}@{current.digest[:8]}"))
-    if not (earlier.path / "entry.json").exists() or others(earlier, current):
-        return target, None
-    move_away(earlier, store.path)
-    return target, earlier.path

@@ -130,17 +130,17 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
 def fitting(among: Sequence[N], name: str) -> list[N]:
     """Return the entries that a name may mean, as `choose` does."""
     whole = [e for e in among if name in _names(e)] or _written(among, name)
-    begun = [e for e in among if any(known.startswith(name) for known in _names(e))]
-    own = {(e.task, e.name) for e in begun}
-    # what `--fresh` set aside is meant where its mark is written
-    return whole or [e for e in begun if (e.task, e.name.partition("@")[0]) not in own or "@" not in e.name]
+    return whole or [e for e in among if any(known.startswith(name) for known in _names(e))]
 
 
 def _written(among: Sequence[N], text: str) -> list[N]:
     """Return the entries that a text in the notation of entries means.
 
-    It is compared with labels, its options in any order, and then read as `run` reads it, with presets of tasks.
+    It is compared with labels, its options in any order, and then read as `run` reads it, with presets of tasks. A mark
+    of code may stand behind it: ` @1a2b3c4d`, or the beginning of one.
     """
+    text, at, mark = text.partition(" @")
+    among = [e for e in among if not at or (mark and _mark(e).startswith(mark))]
     task, slash, rest = text.partition("/")
     if not slash or "=" in task:
         task, rest = "", text
@@ -154,7 +154,11 @@ def _written(among: Sequence[N], text: str) -> list[N]:
         if same or written.start or not written.settings:
             return same if written.settings or written.start else []
     names = {task: _name(task, written) for task in {e.task for e in same_task}}
-    return [e for e in same_task if e.name == names[e.task]]
+    return [e for e in same_task if e.name.partition("@")[0] == names[e.task]]
+
+
+def _mark(entry: Named) -> str:
+    return entry.name.partition("@")[2]
 
 
 def _name(task: str, written: notation.Written) -> str | None:
@@ -168,8 +172,8 @@ def _name(task: str, written: notation.Written) -> str | None:
 def _same(written: notation.Written, label: str) -> bool:
     """Return whether a label means the written entry; the algorithm may be left out."""
     try:
-        known = notation.parse_entry(label)
-    except OptionError:  # of a folder that is damaged, or put aside
+        known = notation.parse_entry(label.partition(" @")[0])
+    except OptionError:  # of a folder that is damaged
         return False
     options = ({each.full_name: each.value for each in one.settings} for one in (written, known))
     return (

@@ -75,5 +75,5 @@ def refusal(store: EntryStore, probe: ProbeRecord) -> DependentSeedsError:
         "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
         "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "
         f"{kind.kind}:{name}{plugin}` looks for them, and for those of an environment or algorithm likewise. What was "
-        f"trained is kept in {store.path}; correct the code, and repeat the command with --fresh"
+        f"trained is kept in {store.path}; correct the code, and repeat the command"
     )

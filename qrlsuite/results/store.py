@@ -9,7 +9,7 @@
                         start/            agents with which seeds begin, if the entry begins with trained agents
                         groups/<id>/checkpoint.safetensors, progress.json
                         claims/<id>.json        who is working on which seeds
-                <entry>@1a2b3c4d/               seeds of other code (`qrlsuite.results.codes`)
+                <entry>@1a2b3c4d/               the same entry of other code (`qrlsuite.results.codes`)
 
 Files are replaced atomically (temporary file, fsync, rename) and carry a format version; lines are appended,
 and a torn last line is dropped. Nothing is ever pickled.
@@ -245,6 +245,8 @@ class SeedRun:
     measured:
         Metrics of the environment by name: means over each epoch's validation episodes, (T,); NaN where it measured
         none.
+    time:
+        When its last epoch ended, in UTC; empty if not recorded.
     folder:
         The entry's folder.
     published:
@@ -261,6 +263,7 @@ class SeedRun:
     measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     folder: Path = Path()
     published: bool = False
+    time: str = ""
 
     def __add__(self, other: SeedRun) -> SeedRun:
         """Return the longer run; of two equally long runs the published one."""
@@ -417,14 +420,7 @@ class SeedStore:
         Processor time if it was recorded (training on the CPU), since other work on the cores does not stretch it;
         otherwise time by the clock.
         """
-        return self._timed()[0]
-
-    def _timed(self) -> tuple[float, bool]:
-        """Return the core-seconds, and whether some of them are by the clock."""
-        lines, total = self.times(), 0.0
-        for seconds in (seconds for line in lines for seconds in line.spent):
-            total += seconds
-        return total, any(line.cpu is None for line in lines)
+        return _spent(self.times())[0]
 
     def read(self) -> SeedRun:
         """Return the content of the run so far."""
@@ -436,7 +432,8 @@ class SeedStore:
                 "the seed's folder"
             )
         scores = _scores(columns, self.path) if epochs else np.empty((0, 0), np.float32)
-        seconds, clocked = self._timed()
+        times = self.times()
+        seconds, clocked = _spent(times)
         counts, measured = 0, dict[str, NDArray[np.float64]]()
         for name in columns.column_names:
             outer, _, inner = name.partition(".")
@@ -446,7 +443,18 @@ class SeedStore:
                 measured[inner] = _metric(inner, columns[name], self.path)
         diverged = columns["diverged"].to_pylist() if "diverged" in columns.column_names else []
         first = diverged.index(True) + 1 if True in diverged else None
-        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured, self.path.parent)
+        return SeedRun(
+            self.seed,
+            record,
+            scores,
+            seconds,
+            counts,
+            clocked,
+            first,
+            measured,
+            self.path.parent,
+            time=times[-1].time if times else "",
+        )
 
     def _columns(self) -> pyarrow.Table:
         """Return all epochs as columns: of the table, with newer lines behind them."""
@@ -464,6 +472,14 @@ class SeedStore:
             if number != expected:
                 raise StoreError(f"{self.path}: epoch {expected} is missing (found {number!r})")
         return columns
+
+
+def _spent(lines: Sequence[TimingLine]) -> tuple[float, bool]:
+    """Return the core-seconds, and whether some of them are by the clock."""
+    total = 0.0
+    for seconds in (seconds for line in lines for seconds in line.spent):
+        total += seconds
+    return total, any(line.cpu is None for line in lines)
 
 
 def _scores(columns: pyarrow.Table, path: Path) -> NDArray[np.float32 | np.float64]:
@@ -608,9 +624,20 @@ class EntryStore:
 
     @property
     def mark(self) -> str:
-        """The end of the folder's name if these seeds are of another code, `@1a2b3c4d`; else empty."""
+        """The end of the folder's name if another code has the name alone: `@1a2b3c4d`; else empty."""
         found = _MARK.search(self.path.name)
         return found[0] if found is not None and found.end() == len(self.path.name) else ""
+
+    @property
+    def name(self) -> str:
+        """The folder's name without the mark."""
+        return self.path.name.removesuffix(self.mark)
+
+    @property
+    def trained(self) -> str:
+        """When the newest epoch of its seeds ended, in UTC; empty if not recorded."""
+        times = [self.seed(seed).times()[-1:] for seed in self.seeds()]
+        return max((line.time for lines in times for line in lines), default="")
 
     @classmethod
     def find(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:
@@ -619,13 +646,21 @@ class EntryStore:
         Parameters
         ----------
         mark:
-            Mark of seeds of another code, which lie beside the entry's own seeds.
+            Mark of another code than that of the folder without a mark.
         """
         store = cls(runs / entry.task.name / f"{entry.name}{mark}")
         genuine.require_no_link(store.path.parent, store.path)
         if (store.path / "entry.json").exists() and store.record().hash != entry.hash:
             raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
         return store
+
+    @classmethod
+    def of_name(cls, runs: Path, entry: Entry) -> list[EntryStore]:
+        """Return the folders of an entry below a results folder, one for each code; the one without a mark first."""
+        others = (runs / entry.task.name).glob(f"{entry.name}@*")
+        marks = dict.fromkeys(["", *sorted(cls(path).mark for path in others)])
+        stores = [cls.find(runs, entry, mark) for mark in marks]
+        return [store for store in stores if (store.path / "entry.json").exists()]
 
     @classmethod
     def create(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:

@@ -15,7 +15,7 @@ from rich.text import Text
 from qrlsuite import registry, specs
 from qrlsuite.engine.budget import seconds
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.missing import find, require_same_code, require_trainable, train
+from qrlsuite.engine.missing import find, places, require_trainable, train
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
@@ -267,7 +267,7 @@ def take_looks(study: StudyWithLooks, where: Where, budget: str | None, quiet: b
 
     Unless it is quiet, it prints the decisions of every look.
     """
-    require_same_code(study.folder, list(study.entries.values()), where, quiet)
+    places(study.folder, list(study.entries.values()), where, quiet)
     study.begin()
     state, began, submitted = study.look(), time.monotonic(), tuple[str, ...]()
     while wanted := state.decision.wanted:

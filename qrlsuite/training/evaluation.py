@@ -136,9 +136,7 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
 
 def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device: str = "cpu") -> Trainer:
     """Return finished runs of an entry with their trained parameters, as one population that can act."""
-    codes.require_installed(
-        store, seeds, identity.of(store.entry())
-    )  # not of another backend that they act on
+    codes.require_installed(store, identity.of(store.entry()))  # not of another backend that they act on
     stored = [store.seed(seed).parameters() for seed in seeds]
     trainer = Trainer(entry, seeds, device)
     state = _state(trainer)

@@ -232,8 +232,7 @@ Part = tuple[Entry, store.EntryStore, Sequence[int]]
 def _required_code(entry: Entry, entry_store: store.EntryStore) -> CodeIdentity:
     """Return the identity of the code here, unless another one was sent to train the entry or has begun it."""
     code = identity.of(entry)
-    codes.require_sent(entry_store, code, socket.gethostname())
-    codes.require(entry_store, code)
+    codes.require(entry_store, code, socket.gethostname())
     return code
 
 

@@ -649,7 +649,7 @@ class Trainer:
             if self.statistics is not None:
                 self.statistics.load_state_dict(_part(arrays, PREFIX))
         except (KeyError, ValueError, RuntimeError) as error:
-            raise StoreError(f"the checkpoint does not fit this version: {error}") from error
+            raise StoreError(f"the checkpoint does not fit: {own.failure(error)}") from error
         self.epoch = epoch
 
     @own.blamed()

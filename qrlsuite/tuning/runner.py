@@ -116,12 +116,15 @@ def _run(
 
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
-        computed = missing.require_same_code(runs / FOLDER, entries, where, display.console.quiet)
+        places = missing.places(runs / FOLDER, entries, where, display.console.quiet)
         missing.require_trainable(entries, where)
-        works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
-        for work, code in zip(works, computed):
+        works = [
+            missing.find(runs / FOLDER, entry, where, seeds, epochs, store)
+            for entry, (store, _) in zip(entries, places)
+        ]
+        for work, (_, code) in zip(works, places):
             missing.check_memory(work, where)
-            store = EntryStore.create(work.runs, work.entry)
+            store = EntryStore.create(work.runs, work.entry, work.store.mark)
             codes.prepare(store, code, identity.plugins(work.entry))
             trained += len(work.todo)
         display.begin_trials(works)

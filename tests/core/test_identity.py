@@ -1,4 +1,4 @@
-"""One name is one thing: seeds of another code are neither continued nor ranked as the same entry."""
+"""Code is part of an entry's name: seeds of another code are neither continued nor ranked as the same entry."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ import pytest
 
 from qrlsuite import registry, specs
 from qrlsuite.engine import missing
-from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.where import Where
-from qrlsuite.errors import StoreError, UnknownNameError
+from qrlsuite.errors import StoreError
 from qrlsuite.experiment import identity, source
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results import codes
 from qrlsuite.results.claims import acquire
+from qrlsuite.results.records import SameCodeRecord
 from qrlsuite.results.store import EntryStore, read_json, write_json
 from tests.commands import qrlsuite, start_worker
 from tests.conftest import TINY, Train, install, installed
@@ -157,8 +157,8 @@ class Author:
     def entries(self) -> list[str]:
         return sorted(path.parent.name for path in self.runs.glob("*/*/entry.json"))
 
-    def board(self) -> dict[str, int]:
-        done = self.command("leaderboard", "--format", "json")
+    def board(self, *words: str) -> dict[str, int]:
+        done = self.command("leaderboard", "--format", "json", *words)
         assert done.returncode == 0, done.stderr
         (section,) = json.loads(done.stdout)["sections"]
         return {row["label"]: row["seeds"] for row in section["rows"]}
@@ -185,13 +185,7 @@ def trained(line: Path, tmp_path: Path) -> Author:
 
 def test_its_author_may_say_that_nothing_changed(trained: Author) -> None:
     trained.edit("own_helper", "filled(layer, generator):", "filled(layer, generator, more=None):")
-    refused = trained.run(model="line", seeds="4")
-    assert refused.returncode == 2
-    assert "own_helper.py of own (model 'line') has changed" in refused.stderr
     assert trained.run("--same", " ", model="line").returncode == 2
-    both = trained.run("--same", "no", "--fresh", model="line")
-    assert both.returncode == 2
-    assert "give one of them" in both.stderr
     assert trained.run("--same", "an argument that nobody gives", model="line", seeds="4").returncode == 0
     assert list(trained.board().values()) == [4]
     (name,) = trained.entries()
@@ -199,6 +193,34 @@ def test_its_author_may_say_that_nothing_changed(trained: Author) -> None:
     assert said["reason"] == "an argument that nobody gives"
     assert len(said["codes"]) == 2
     assert trained.run(model="line", seeds="5").returncode == 0  # it is said once
+    assert list(trained.board().values()) == [5]
+
+
+def test_nothing_is_the_same_whose_checkpoint_does_not_load(trained: Author) -> None:
+    trained.edit(
+        "own_model", "return filled(layer, generator)", "return nn.Sequential(filled(layer, generator))"
+    )
+    refused = trained.run("--same", "a name", model="line", seeds="3")
+    assert refused.returncode == 2
+    assert "loading the checkpoint of seed 0 fails: the checkpoint does not fit: " in refused.stderr
+    (name,) = trained.entries()
+    assert "same" not in read_json(trained.runs / "tiny" / name / "entry.json")
+    anew = trained.run(model="line", seeds="3")
+    assert anew.returncode == 0
+    (mark,) = {entry.removeprefix(name) for entry in trained.entries()} - {""}
+    assert f"{Path('runs', 'tiny', name)} has seeds 0:2 of another code: own_model.py of own" in anew.stderr
+    assert f' {mark}\'; --same "REASON" continues the old seeds' in anew.stderr
+    assert "another code" not in trained.run(model="line", seeds="3").stderr, "it is said once"
+    [(label, seeds)] = trained.board().items()
+    assert (label.endswith(f" {mark}"), seeds) == (True, 3)
+    assert list(trained.board("--all-codes").values()) == [2, 3]
+    assert f"left out: 1 entry of other code than '{label}'" in trained.command("leaderboard").stderr
+    trained.edit(
+        "own_model", "return nn.Sequential(filled(layer, generator))", "return filled(layer, generator)"
+    )
+    assert trained.run(model="line", seeds="4").returncode == 0
+    assert trained.board() == {label.removesuffix(f" {mark}"): 4}, "the newest code has the newest epoch"
+    assert len(trained.entries()) == 2
 
 
 def test_docstrings_and_other_modules_do_not_count(trained: Author) -> None:
@@ -214,9 +236,8 @@ def test_a_file_that_an_option_names_counts(author: Author) -> None:
     words = ("--set", f"data={data}")
     assert author.run(*words, model="line").returncode == 0
     data.write_bytes(b"2")
-    refused = author.run(*words, model="line", seeds="3")
-    assert refused.returncode == 2
-    assert "the file 'model.data' has another content" in refused.stderr
+    assert "the file 'model.data' has another content" in author.run(*words, model="line", seeds="3").stderr
+    assert len(author.entries()) == 2
 
 
 def test_a_plugins_seeds_from_before_need_a_word(trained: Author) -> None:
@@ -224,12 +245,10 @@ def test_a_plugins_seeds_from_before_need_a_word(trained: Author) -> None:
     store = EntryStore(trained.runs / "tiny" / name)
     for seed in store.seeds():
         edit_json(store.seed(seed).path / "run.json", code=None)
-    refused = trained.run(model="line", seeds="3")
-    assert refused.returncode == 2
-    assert "before the code of plugins was recorded" in refused.stderr
-    assert trained.run("--fresh", model="line").returncode == 0
-    assert trained.entries() == sorted([name, f"{name}@00000000"])
-    assert len(trained.board()) == 2
+    assert "before the code of plugins was recorded" in trained.run(model="line", seeds="3").stderr
+    assert list(trained.board("--all-codes").values()) == [2, 3]
+    assert trained.run("--same", "it was never edited", model="line", seeds="4").returncode == 0
+    assert store.seeds() == [0, 1, 2, 3]
 
 
 def test_a_worker_with_other_code_refuses(trained: Author) -> None:
@@ -258,7 +277,7 @@ def test_an_export_carries_the_code_and_is_verified_with_it(trained: Author) -> 
     assert "own_helper.py of own" in other.stdout + other.stderr
 
 
-def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(trained: Author) -> None:
+def test_other_code_neither_plays_nor_exports_what_was_trained_and_imports_it_apart(trained: Author) -> None:
     assert trained.command("export", "line", "--out", "out").returncode == 0
     trained.edit("own_helper", "rand(", "randn(")
     for words in (("evaluate", "line", "--best", "1", "--episodes", "4"), ("export", "line", "--out", "out")):
@@ -266,17 +285,15 @@ def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(tr
         assert refused.returncode == 2
         assert "own_helper.py of own (model 'line') has changed" in refused.stderr
     before, trained.runs = trained.runs, trained.folder / "more"
-    assert trained.run(model="line", seeds="2:4").returncode == 0
+    assert trained.run(model="line", seeds="2:5").returncode == 0
     for folder in (before, trained.folder / "out"):
-        refused = trained.command("import", str(folder))
-        assert "are not all of one code" in refused.stdout + refused.stderr
-        assert "own_helper.py of own" in refused.stdout + refused.stderr
-    assert list(trained.board().values()) == [2]
+        assert trained.command("import", str(folder)).returncode == 0
+    assert sorted(trained.board("--all-codes").values()) == [2, 3]
 
 
-def test_a_results_folder_is_taken_over_with_the_seeds_that_fresh_put_aside(trained: Author) -> None:
+def test_a_results_folder_is_taken_over_with_all_codes(trained: Author) -> None:
     trained.edit("own_helper", "rand(", "randn(")
-    assert trained.run("--fresh", model="line").returncode == 0
+    assert trained.run(model="line").returncode == 0
     before, trained.runs = trained.runs, trained.folder / "more"
     held = sorted(path.relative_to(before) for path in before.glob("*/*/seed-*/run.json"))
     assert len(held) == 4
@@ -285,7 +302,7 @@ def test_a_results_folder_is_taken_over_with_the_seeds_that_fresh_put_aside(trai
         assert done.returncode == 0, done.stdout + done.stderr
         found = [path.relative_to(trained.runs) for path in trained.runs.glob("*/*/seed-*/run.json")]
         assert sorted(found) == held
-    assert list(trained.board().values()) == [2, 2]
+    assert list(trained.board("--all-codes").values()) == [2, 2]
 
 
 STUDY = """
@@ -302,7 +319,7 @@ kind = "curves"
 """
 
 
-def test_searches_studies_and_python_stop_as_well(author: Author) -> None:
+def test_searches_studies_and_python_begin_anew_as_well(author: Author) -> None:
     (author.folder / "lines.toml").write_text(STUDY)
     budget = ("--seeds", "1", "--epochs", "1", "--workers", "1")
     tune = ("tune", "line", "--task", str(author.task), "--vary", "lr=1e-2,1e-3", *budget)
@@ -310,21 +327,16 @@ def test_searches_studies_and_python_stop_as_well(author: Author) -> None:
     for words in (tune, study):
         assert (done := author.command(*words)).returncode == 0, done.stderr
     author.edit("own_helper", "rand(", "randn(")
-    for words in (tune, study):
-        refused = author.command(*words)
-        assert refused.returncode == 2
-        assert "own_helper.py of own (model 'line') has changed" in refused.stderr
-        assert "Nothing was trained" in refused.stderr
+    said = [author.command(*words).stderr for words in (tune, study)]
+    assert all(text.count("own_helper.py of own (model 'line') has changed") == 1 for text in said)
+    assert "(and so for 1 more entry)" in said[0]
+    assert len(author.entries()) == 2
+    assert len(list((author.runs / "tuning").glob("*/*@*/entry.json"))) == 2
+    author.edit("own_helper", "randn(", "normal(0.0, 1.0, ")
     program = f"""if True:
         import qrlsuite
         words = dict(seeds=1, epochs=1, workers=1, runs={str(author.runs)!r}, progress=False)
-        try:
-            qrlsuite.train("tiny.toml", "line", **words)
-        except qrlsuite.errors.StoreError as error:
-            assert "has changed" in str(error)
-        else:
-            raise SystemExit("it goes on")
-        print(qrlsuite.train("tiny.toml", "line", fresh=True, **words).seeds)
+        print("@" in qrlsuite.train("tiny.toml", "line", **words).name)
     """
     environment = installed(author.site)
     done = subprocess.run(
@@ -335,11 +347,8 @@ def test_searches_studies_and_python_stop_as_well(author: Author) -> None:
         cwd=author.folder,
         check=False,
     )
-    assert done.stdout == "(0,)\n", done.stderr
-    for words in (tune, study):
-        assert (done := author.command(*words, "--fresh")).returncode == 0, done.stderr
-    assert len(author.entries()) == 2
-    assert len(list((author.runs / "tuning").glob("*/*@*/entry.json"))) == 2
+    assert done.stdout == "True\n", done.stderr
+    assert len(author.entries()) == 3
 
 
 def test_the_steps_to_the_identity_can_be_read(author: Author) -> None:
@@ -364,9 +373,8 @@ def test_an_environment_of_another_package_counts(author: Author) -> None:
     author.task.write_text(TINY.replace(TINY[TINY.index("[environment]") : TINY.index("[protocol]")], GYM))
     assert author.run(model="line").returncode == 0, author.run(model="line").stderr
     author.edit("own_rules", "5", "6")
-    refused = author.run(model="line", seeds="3")
-    assert refused.returncode == 2
-    assert "own_rules.py of unknown (environment 'own_world:own/World-v0') has changed" in refused.stderr
+    anew = author.run(model="line", seeds="3")
+    assert "own_rules.py of unknown (environment 'own_world:own/World-v0') has changed" in anew.stderr
 
 
 def edit_json(path: Path, **values: Any) -> None:
@@ -388,92 +396,56 @@ def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(
     record = read_json(folder / "seed-0000" / "run.json")
     assert record["provenance"][0]["numerics"] == {"environment": 1, "algorithm": 1, "model": 1}
     edit_json(folder / "seed-0000" / "run.json", code=None)  # as earlier versions left it
-    train("runs", range(3), epochs=2)
+    assert train("runs", range(3), epochs=2) == folder
     assert "code" not in read_json(folder / "seed-0000" / "run.json")
-    assert [group.seeds for group in codes.of_seeds(EntryStore(folder))] == [(0, 1, 2)]
+    entry = collect.read(EntryStore(folder))
+    assert entry is not None
+    assert (entry.seeds, entry.refused) == ((0, 1, 2), ())
 
     with_numerics(monkeypatch, "algorithms", "ddqn", 2)
-    with pytest.raises(StoreError, match="algorithm 'ddqn' has numerics 2, and had 1"):
-        train("runs", range(4), epochs=2)
-    only_old = EntryStore(folder)
-    for seed in (1, 2):
-        edit_json(only_old.seed(seed).path / "run.json", code=None)
-    with pytest.raises(StoreError, match="algorithm 'ddqn' has numerics 2, and had 1"):
-        train("runs", range(4), epochs=2)
+    anew, store = (
+        codes.place(folder.parents[1], EntryStore(folder).entry(), current(folder)),
+        EntryStore(folder),
+    )
+    assert anew.path.name == f"{folder.name}@{current(folder).digest[:8]}"
+    held = codes.of(store)
+    assert held is not None
+    assert held.change(current(folder)) == "algorithm 'ddqn' has numerics 2, and had 1"
+    with pytest.raises(
+        StoreError, match="has seeds of another code: algorithm 'ddqn' has numerics 2, and had 1"
+    ):
+        codes.require(EntryStore(folder), current(folder), "here")
 
 
-def test_a_folder_of_two_codes_is_two_entries(kept: Train, tmp_path: Path) -> None:
+def current(folder: Path) -> identity.CodeIdentity:
+    return identity.of(EntryStore(folder).entry())
+
+
+def test_seeds_of_other_code_in_one_folder_do_not_count(kept: Train, tmp_path: Path) -> None:
     folder = kept("runs", range(4), epochs=1)
-    store = EntryStore(folder)
     parts = read_json(folder / "seed-0000" / "run.json")["code"]["parts"]
     other = identity.CodeIdentity((*parts[:2], {**parts[2], "numerics": 3}))
     for seed in (1, 3):
-        edit_json(store.seed(seed).path / "run.json", code=other.record())
-    found, refused = collect.collect(collect.Selection(tmp_path / "runs"))
-    first = read_json(folder / "seed-0000" / "run.json")["code"]["digest"]
-    assert not refused
-    assert {entry.label: entry.seeds for entry in found} == {
-        f"ddqn mlp width=16 @{first[:8]}": (0, 2),
-        f"ddqn mlp width=16 @{other.digest[:8]}": (1, 3),
-    }
-    with pytest.raises(
-        UnknownNameError, match=f"write 'ddqn mlp width=16 @{first[:8]}', 'ddqn mlp width=16 @"
-    ):
-        collect.find(collect.Selection(tmp_path / "runs"), "mlp")
-    assert collect.find(collect.Selection(tmp_path / "runs"), f"mlp width=16 @{other.digest[:4]}").seeds == (
-        1,
-        3,
+        edit_json(folder / f"seed-{seed:04d}" / "run.json", code=other.record())
+    (entry,), refused = collect.collect(collect.Selection(tmp_path / "runs"))
+    assert entry.seeds == (0, 2)
+    assert [line.partition(":")[0] for line in refused] == ["seed 1", "seed 3"]
+    assert all("of another code than that of its first seed" in line for line in refused)
+    codes.link(EntryStore(folder), other, "renamed")
+    (entry,), _ = collect.collect(collect.Selection(tmp_path / "runs"))
+    assert entry.seeds == (0, 1, 2, 3)
+
+
+def test_a_board_shows_the_newest_code_with_enough_seeds() -> None:
+    first, second = (
+        identity.CodeIdentity(({"role": "model", "name": name, "distribution": "x"},)) for name in "ab"
     )
-    assert collect.find(collect.Selection(tmp_path / "runs"), f"{folder}@{first[:8]}").seeds == (0, 2)
-    with pytest.raises(StoreError, match="several entries"):
-        collect.read(store)
-
-
-def test_a_published_entry_of_other_code_is_another_entry(kept: Train, tmp_path: Path) -> None:
-    folder = kept("runs", range(2), epochs=1)
-    entry = collect.read(EntryStore(folder))
-    assert entry is not None
-    assert entry.codes == (identity.of(resolve("beam6g", "mlp width=16")).digest,)
-    entry = boards.changed(entry, code=None)  # as an entry published before codes were recorded
-    other = identity.CodeIdentity(({"role": "model", "name": "other", "distribution": "x"},))
-    copies = [entry, boards.changed(entry, code=other), boards.changed(entry, published=True)]
-    assert [[copy.label for copy in same] for same in collect.told_apart(copies)] == [
-        ["ddqn mlp width=16 @00000000"] * 2,
-        [f"ddqn mlp width=16 @{other.digest[:8]}"],
-    ]
-
-
-def test_seeds_are_set_aside_only_where_nobody_has_them(
-    train: Train, tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = train("runs", range(2), epochs=1)
-    store, entry = EntryStore(folder), resolve(tiny_task, "mlp width=16")
-    with_numerics(monkeypatch, "models", "mlp", 3)
-    now, runs = identity.of(entry), tmp_path / "runs"
-    claim = acquire(store, [0])
-    with pytest.raises(StoreError, match="are being trained by process"):
-        codes.set_aside(runs, store, now)
-    claim.release()
-    edit_json(folder / "entry.json", plan="1a2b3c4d5e6f7a8b")
-    with pytest.raises(StoreError, match="write another study"):
-        codes.set_aside(runs, store, now)
-    with pytest.raises(StoreError, match="Restore that code, or write another study"):
-        codes.require(store, now)
-    edit_json(folder / "entry.json", plan=None)
-    submitted = store.path / "slurm" / "submitted.json"
-    write_json(submitted, {"tasks": [{"job": "7", "seeds": [2], "epochs": 1}]})
-    with pytest.raises(StoreError, match="waits in a queue"):
-        codes.set_aside(runs, store, now, {2})
-    submitted.unlink()
-    mark = codes.of_seeds(store)[0].mark
-    taken = folder.with_name(f"{folder.name}@{mark}")
-    taken.mkdir()
-    with pytest.raises(StoreError, match="is there already"):
-        codes.set_aside(runs, store, now)
-    taken.rmdir()
-    assert codes.set_aside(runs, store, now) == (taken, None)
-    assert codes.set_aside(runs, store, now) == (None, None)
-    assert EntryStore(taken).seeds() == [0, 1]
+    newer = boards.changed(boards.entry("mlp", 19), code=second, time="2026-01-02")
+    for seeds, expected in ((19, [newer]), (20, None)):
+        older = boards.changed(boards.entry("mlp", seeds), code=first, time="2026-01-01")
+        assert collect.by_code([older, newer])[0] == (expected or [older])
+    link = SameCodeRecord(codes=[first.digest, second.digest])
+    assert len(collect.by_code([boards.changed(older, same=[link]), newer])) == 1
 
 
 def test_what_somebody_trains_is_not_begun_with_other_code(
@@ -484,30 +456,10 @@ def test_what_somebody_trains_is_not_begun_with_other_code(
     codes.prepare(store, identity.of(entry))
     claim = acquire(store, [0])  # of a seed that is being built, and has no record yet
     with_numerics(monkeypatch, "models", "mlp", 3)
-    here = Where.create(workers=1)
-    work = missing.find(runs, entry, here, [0, 1], 1)
-    with pytest.raises(
-        StoreError, match="than the machine that started it: model 'mlp' has numerics 3, and had 2"
-    ):
-        missing.train(work, here, RunDisplay(work, 1, quiet=True))
+    mark = f"@{identity.of(entry).digest[:8]}"
+    assert missing.find(runs, entry, Where.create(workers=1), [0, 1], 1).store.mark == mark
     claim.release()
-    assert not store.seeds()
-
-
-def test_all_entries_are_looked_at_before_one_is_trained(
-    train: Train,
-    tiny_task: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    train("runs", range(2), epochs=1)
-    with_numerics(monkeypatch, "models", "mlp", 3)
-    entries = [resolve(tiny_task, "mlp width=8"), resolve(tiny_task, "mlp width=16")]
-    with pytest.raises(StoreError, match="model 'mlp' has numerics 3, and had 2"):
-        missing.require_same_code(tmp_path / "runs", entries, Where.create())
-    missing.require_same_code(tmp_path / "runs", entries, replace(Where.create(), fresh=True))
-    assert capsys.readouterr().err.count("the seeds of another code are now in") == 1
+    assert missing.find(runs, entry, Where.create(workers=1), [0, 1], 1).store.mark == ""
 
 
 @pytest.mark.parametrize(
@@ -517,7 +469,6 @@ def test_all_entries_are_looked_at_before_one_is_trained(
 def test_a_damaged_identity_is_named(kept: Train, tmp_path: Path, code: Any) -> None:
     folder = kept("runs", range(2), epochs=1)
     edit_json(folder / "seed-0001" / "run.json", code=code)
-    assert [group.seeds for group in codes.of_seeds(EntryStore(folder))] == [(0,)]
     _, (line,) = collect.collect(collect.Selection(tmp_path / "runs"))
     assert re.match(r"seed 1: .*seed-0001/run\.json is not a run's record: .*code", line)
 

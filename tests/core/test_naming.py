@@ -156,11 +156,15 @@ def test_a_task_narrows_the_search(
         say(*(word.replace("mlp width=8", "ddqn vqc") for word in words), "--task", "tiny")
 
 
-def test_seeds_that_were_set_aside_are_meant_where_their_mark_is_written() -> None:
+def test_an_entry_of_later_code_is_meant_where_its_mark_is_written() -> None:
     known = [
-        Entry("ddqn vqc-native qubits=4", "beam6g", "ddqn-vqc-native-1"),
-        Entry("ddqn vqc-native qubits=4 @ad9d", "beam6g", "ddqn-vqc-native-1@ad9d"),
+        Entry("ddqn vqc-native qubits=4 layers=2", "beam6g", "ddqn-vqc-native-1"),
+        Entry("ddqn vqc-native qubits=4 layers=2 @ad9d", "beam6g", "ddqn-vqc-native-1@ad9d"),
     ]
-    assert lookup.choose(known, "vqc-native", "runs") is known[0]
-    assert lookup.choose(known, "vqc-native qubits=4 @a", "runs") is known[1]
+    assert lookup.choose(known, "vqc-native qubits=4 layers=2", "runs") is known[0]
+    for name in ("vqc-native", "vqc-native layers=2 qubits=4"):
+        with pytest.raises(UnknownNameError, match=r"any of 'ddqn vqc-native .*=2', '.*=2 @ad9d': write one"):
+            lookup.choose(known, name, "runs")
+    assert lookup.choose(known, "vqc-native qubits=4 layers=2 @a", "runs") is known[1]
+    assert lookup.choose(known, "beam6g/vqc-native layers=2 qubits=4 @a", "runs") is known[1]
     assert lookup.choose(known[1:], "vqc-native", "runs") is known[1]

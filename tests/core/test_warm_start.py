@@ -212,7 +212,7 @@ def test_agents_that_are_there_stay_when_the_source_goes_on(root: Path) -> None:
     train_group(cold.path, [0, 1], 3)
     assert cold.seed(0).agent.read_bytes() != before
     plain = resolve(str(root / "other.toml"), "mlp width=16")
-    begun = begin_with(plain, root / "runs", "tiny/mlp", [0, 1])
+    begun, _ = begin_with(plain, root / "runs", "tiny/mlp", [0, 1])
     assert begun.start == f"tiny/{cold.path.name}:3"
     assert begun.hash != warm.entry().hash, "after more epochs, they are other agents"
     assert warm.start_of(0).read_bytes() == before

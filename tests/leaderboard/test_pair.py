@@ -132,7 +132,7 @@ def test_the_board_of_more_entries_is_stricter() -> None:
     assert among.text.startswith(
         "on the board of 8 entries, which is stricter (28 pairs): not told apart, adjusted p = "
     )
-    renamed = first.marked(BESIDE)
+    renamed = replace(first, mark=BESIDE)
     assert pair.on_board(first, second, [renamed, second, *others], grid, 0.05) == among
     assert pair.on_board(first, second, [first, second], grid, 0.05) is None
     assert pair.on_board(first, few, [first, few, *others], grid, 0.05) is None

@@ -82,6 +82,12 @@ def leaderboard(
         bool,
         typer.Option("--explain", help="Explain columns and marks, and how each pair was decided."),
     ] = False,
+    all_codes: Annotated[
+        bool,
+        typer.Option(
+            "--all-codes", help="Show entries of every code, and not of the newest with 20 seeds alone."
+        ),
+    ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
 ) -> None:
@@ -121,13 +127,13 @@ def leaderboard(
         "entries": entry or (),
     }
     if format_ is Format.html:
-        path, refused = write_page(output, Selection.create(runs, tasks, published), **asked)
+        path, refused = write_page(output, Selection.create(runs, tasks, published, all_codes), **asked)
         _left_out(refused)
         if path is None:
             raise _nothing(runs, tasks)
         typer.echo(f"wrote {path}")
         return
-    board = api.board(tasks, runs=runs, published=published, **asked)
+    board = api.board(tasks, runs=runs, published=published, all_codes=all_codes, **asked)
     if format_ is Format.json:
         typer.echo(json.dumps(board.as_dict()))
         return

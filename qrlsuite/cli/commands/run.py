@@ -25,7 +25,6 @@ from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
     EngineOption,
-    FreshOption,
     SameOption,
     TrackOption,
     WorkersOption,
@@ -94,7 +93,6 @@ def run(
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     device: DeviceOption = "cpu",
-    fresh: FreshOption = False,
     same: SameOption = None,
     track: TrackOption = None,
     yes: Annotated[
@@ -111,7 +109,7 @@ def run(
     Examples: qrlsuite run mlp width=16 --task beam6g --seeds 20; qrlsuite run --task beam6g --model vqc-pennylane
     --set qubits=6
     """
-    where = where_of(engine, workers, device, fresh, same)
+    where = where_of(engine, workers, device, same)
     written = _written(entry or [], model, settings or [], quick)
     work, submitted = train_entry(
         resolve_entry(task, written, runs=runs),

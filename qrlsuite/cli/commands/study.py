@@ -23,7 +23,6 @@ from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
     EngineOption,
-    FreshOption,
     SameOption,
     WorkersOption,
 )
@@ -130,7 +129,6 @@ def run(
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     device: DeviceOption = "cpu",
-    fresh: FreshOption = False,
     same: SameOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -146,9 +144,9 @@ def run(
     Examples: qrlsuite study run fig6 --seeds 20 --budget 30min; qrlsuite study run fig7 mlp width=32;
     qrlsuite study run all --budget 8h
     """
-    where = where_of(engine, workers, device, fresh, same)
+    where = where_of(engine, workers, device, same)
     if name != ALL and (study := studies.find(name)).file.looks is not None:
-        given = {"--seeds": seeds, "--epochs": epochs, "--fresh": fresh, "--dry-run": dry_run}
+        given = {"--seeds": seeds, "--epochs": epochs, "--dry-run": dry_run}
         require_unchanged(name, {**dict.fromkeys(words or (), True), **given})
         outcome = take_looks(study, where, budget, runs, not json_output)
         _report(name, outcome, budget, runs, json_output)

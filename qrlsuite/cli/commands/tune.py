@@ -15,7 +15,6 @@ from qrlsuite.cli.arguments import JsonOption, RunsOption, TrainedTaskOption
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
-    FreshOption,
     SameOption,
     WorkersOption,
 )
@@ -110,7 +109,6 @@ def tune(
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     device: DeviceOption = "cpu",
-    fresh: FreshOption = False,
     same: SameOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -123,7 +121,7 @@ def tune(
 
     Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
-    where = where_of(engine, workers, device, fresh, same)
+    where = where_of(engine, workers, device, same)
     requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective.value, budget)
     path = preset_path(out, requests)
     searches = tuning_runner.build(requests, runs)
