@@ -22,8 +22,7 @@ def register(thing: Thing) -> Thing:
     """Load a plugin's file or folder, and show its circuits and networks; in a plugin's file, register something of it.
 
     A notebook writes a cell to a file with `%%writefile mine.py`, and calls `qrlsuite.register("mine.py")`. After an
-    edit, run both again: the file's things replace the ones of before. Results stay under the code that made them: seeds
-    of other code are another entry.
+    edit, run both again: the file's things replace the ones of before. Seeds of the edited code are another entry.
 
     Parameters
     ----------
