@@ -207,7 +207,7 @@ def _registration(registered: Sequence[specs.Spec], module: str, inner: str) -> 
         "from __future__ import annotations\n\nfrom collections.abc import Callable\n\n"
         "from qrlsuite import hookimpl, specs\n"
     ]
-    for kind in dict.fromkeys(map(type, registered)):
+    for kind in dict.fromkeys(type(spec) for spec in registered):
         calls = [spec for spec in registered if type(spec) is kind]
         pieces.append(
             f"@hookimpl\ndef register_{kind.kinds}(register: Callable[[specs.{kind.__name__}], None]) -> None:\n"
