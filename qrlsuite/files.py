@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+import errno
 import functools
+import os
+import stat
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args, get_origin
+from typing import IO, Any, TypeVar, cast, get_args, get_origin
 
 import pydantic
 
 from qrlsuite.errors import FileError, nearest
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return a file's bytes, see `open_regular`."""
+    with open_regular(path) as file:
+        return file.read()
+
+
+def open_regular(path: Path) -> IO[bytes]:
+    """Open a file of a results folder to read it. A pipe in its place would keep the reader waiting for ever.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is a pipe or a device.
+    """
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return os.fdopen(handle, "rb")
+    os.close(handle)
+    raise OSError(errno.EINVAL, "not a regular file", str(path))
 
 
 def load(path: Path, model: type[Model], what: str) -> Model:

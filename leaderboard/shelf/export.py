@@ -14,6 +14,7 @@ import numpy as np
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
+from qrlsuite.files import read_bytes
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
@@ -116,7 +117,7 @@ def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Ma
     origins = _distinct(_made_with(record.provenance) for record in records)
     stated["agents"]["provenance"] = [origin.content for origin in origins]
     extended = there.record.changed(published={**there.published.content, **stated})
-    kept = {name: (folder / name).read_bytes() for name in (published.CURVES, published.SEEDS)}
+    kept = {name: read_bytes(folder / name) for name in (published.CURVES, published.SEEDS)}
     _replace(folder, {"entry.json": published.encode_record(extended.content), **kept, **files})
     published.read(folder).parameters()
     return True

@@ -29,6 +29,7 @@ from qrlsuite.engine.terminal import command
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
+from qrlsuite.files import read_bytes
 from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.notation import parse_entry
@@ -361,7 +362,7 @@ def _check_agents(folder: Path, stated: AgentsRecord | None, seeds: Sequence[int
 
 
 def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def _require(holds: bool, folder: Path, problem: str) -> None:

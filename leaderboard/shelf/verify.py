@@ -12,14 +12,15 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.errors import QrlSuiteError, listed
+from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.files import read_bytes
 from qrlsuite.leaderboard.shelf import plausible, published
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.leaderboard.shelf.curves import current
@@ -30,6 +31,9 @@ from qrlsuite.results.progress import Progress
 from qrlsuite.results.records import Provenance
 from qrlsuite.results.store import learning_curve
 from qrlsuite.results.text import hours_text
+
+if TYPE_CHECKING:
+    from qrlsuite.training.trainer import Trainer
 
 AGREEMENT = 1e-5
 """How closely the beginnings of runs agree between machines, relative to 1 or the value."""
@@ -179,21 +183,39 @@ def verify(
 
 
 def _check_agents(entry: PublishedEntry) -> None:
-    """Check that agents match the record, are finite, and fit the model where it is installed."""
+    """Check numbers of parameters; agents match the record and fit the model. What is not installed is not checked."""
     agents = entry.parameters()
-    if not agents or absent(entry.entry_results()):
+    if absent(entry.entry_results()):
         return
     from qrlsuite.training.evaluation import require_fitting  # torch, which checking files does without
     from qrlsuite.training.trainer import Trainer
 
     trainer = Trainer(entry.record.entry(str(entry.folder / "entry.json")), [0])
-    require_fitting(trainer, agents[entry.agents[0]], entry.folder / published.AGENTS)
+    if problem := _other_parameters(entry, _parameters(trainer)):
+        raise StoreError(f"{entry.folder}: {problem}")
+    if agents:
+        require_fitting(trainer, agents[entry.agents[0]], entry.folder / published.AGENTS)
+
+
+def _parameters(trainer: Trainer) -> tuple[Mapping[str, int], ...]:
+    """Return the numbers of an agent's parameters, and those of its first network alone, which older records have."""
+    first = dict(zip(("classical", "quantum", "fixed"), trainer.models.parameters[0]))
+    return trainer.models.trained(), first
+
+
+def _other_parameters(entry: PublishedEntry, counted: Sequence[Mapping[str, int]]) -> str | None:
+    """Name numbers of parameters that differ from an entry's record; None if they agree."""
+    stated = entry.published.parameters
+    allowed = counted if "networks" not in stated else counted[:1]
+    if any(_same_parameters(stated, each) for each in allowed):
+        return None
+    return f"its record has parameters {dict(stated)}, counted here: {dict(counted[0])}"
 
 
 def _digest(folder: Path) -> str:
     """Return a hash of an entry's files; the record has the hash of the agents."""
     paths = (folder / name for name in ("entry.json", published.CURVES, published.SEEDS))
-    hashes = b"".join(hashlib.sha256(path.read_bytes()).digest() for path in paths)
+    hashes = b"".join(hashlib.sha256(read_bytes(path)).digest() for path in paths)
     return hashlib.sha256(hashes).hexdigest()[:16]
 
 
@@ -334,15 +356,12 @@ def _group(
         for name, values in epoch.measured.items():
             measured.setdefault(name, np.full((len(seeds), epochs), np.nan))[:, trainer.epoch - 1] = values
         trainer.progress.epoch = trainer.epoch
-    classical, quantum, fixed = trainer.models.parameters[0]
-    first = {"classical": classical, "quantum": quantum, "fixed": fixed}
     policy = trainer.policy()
     agents = tuple(
         {name: np.atleast_1d(values[s]) for name, values in policy.items()} for s in range(len(seeds))
     )
-    counts = trainer.models.trained(), first
     own = tuple({name: values[s] for name, values in measured.items()} for s in range(len(seeds)))
-    return Retrained(np.stack(curves, axis=1), executions, agents, counts, own)
+    return Retrained(np.stack(curves, axis=1), executions, agents, _parameters(trainer), own)
 
 
 def _counts(
@@ -352,10 +371,8 @@ def _counts(
 
     Seeds with equal curves have equal circuit executions. In other seeds they depend on the lengths of episodes.
     """
-    stated = entry.published.parameters
-    allowed = again.parameters if "networks" not in stated else again.parameters[:1]
-    if not any(_same_parameters(stated, counted) for counted in allowed):
-        return f"its record has parameters {dict(stated)}, counted here: {dict(again.parameters[0])}"
+    if problem := _other_parameters(entry, again.parameters):
+        return problem
     executions = entry.executions[list(places)]
     wrong = np.flatnonzero(equal & (executions != again.executions))
     if len(wrong):

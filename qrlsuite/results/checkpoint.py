@@ -21,6 +21,7 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as encode
 
 from qrlsuite.errors import StoreError
+from qrlsuite.files import open_regular
 from qrlsuite.results.records import FORMAT_VERSION
 from qrlsuite.results.store import Arrays as Arrays
 from qrlsuite.results.store import EntryStore, write_atomically
@@ -85,7 +86,7 @@ def headers(store: EntryStore) -> list[Header]:
     headers_found = []
     for path in sorted(store.groups.glob(f"*/{FILE}")):
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 length = int.from_bytes(file.read(8), "little")
                 if length > 100_000_000:
                     raise ValueError("header too long")

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Literal
 
 from qrlsuite.errors import StoreError
+from qrlsuite.files import read_bytes
 from qrlsuite.results.store import EntryStore, cause
 
 HEARTBEAT = 5.0
@@ -63,7 +64,7 @@ class Claim:
         A file system that does not answer for a moment is no reason to give up.
         """
         try:
-            if json.loads(self.path.read_bytes()).get("token") != self.token:
+            if json.loads(read_bytes(self.path)).get("token") != self.token:
                 return False
             os.utime(self.path)
         except (FileNotFoundError, ValueError, AttributeError):
@@ -181,7 +182,7 @@ def _file_system_time(folder: Path) -> float:
 
 def _read(path: Path) -> Claim | None:
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_bytes(path))
         return Claim(
             path=path,
             host=str(content["host"]),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from qrlsuite.errors import StoreError
+from qrlsuite.files import read_bytes
 
 if TYPE_CHECKING:
     from qrlsuite.results.records import RunRecord
@@ -94,7 +95,7 @@ def _finite_agent(path: Path) -> bytes | None:
     from safetensors.numpy import load
 
     try:
-        content = path.read_bytes()
+        content = read_bytes(path)
         arrays = load(content)
     except (OSError, SafetensorError, ValueError, KeyError, TypeError):
         return None

@@ -20,6 +20,7 @@ import pyarrow
 import pyarrow.parquet
 
 from qrlsuite.errors import StoreError
+from qrlsuite.files import read_bytes
 
 MOST_VALUES = 20_000_000
 """Values in a file, at most: 100,000 epochs of 200 numbers."""
@@ -48,7 +49,7 @@ def read(path: Path, values: int = MOST_VALUES) -> pyarrow.Table:
     """
     try:
         size = path.stat().st_size
-        content = path.read_bytes() if size <= MOST_BYTES else b""
+        content = read_bytes(path) if size <= MOST_BYTES else b""
         if size > MOST_BYTES or _decoded(content) > values:
             raise StoreError(f"{path}: unpacks to more than {min(values, MOST_BYTES // 8):,} values: refused")
         table = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(content)).read(use_threads=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from qrlsuite.errors import StoreError
+from qrlsuite.files import read_bytes
 from qrlsuite.results.store import EntryStore, cause, write_atomically
 
 
@@ -100,7 +101,7 @@ class ProgressFile:
 def read_progress(path: Path) -> dict[str, Any]:
     """Read a progress file; empty where it is missing or damaged."""
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_bytes(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -39,6 +39,7 @@ from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import EntryTuning
+from qrlsuite.files import read_bytes
 from qrlsuite.results import genuine, parquet
 from qrlsuite.results.records import (
     FORMAT_VERSION,
@@ -99,7 +100,7 @@ def _umask() -> int:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object with a format version."""
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_bytes(path))
     except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from None
     if not isinstance(content, dict):
@@ -128,7 +129,7 @@ def json_line(record: Mapping[str, Any]) -> bytes:
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """Read JSON lines; a torn last line (a writer was killed) is dropped."""
     try:
-        pieces = path.read_bytes().split(b"\n")
+        pieces = read_bytes(path).split(b"\n")
     except FileNotFoundError:
         return []
     except OSError as error:
@@ -166,7 +167,7 @@ def read_arrays(path: Path, most: int = MOST_AGENT_BYTES) -> Arrays:
     try:
         if (size := path.stat().st_size) > most:
             raise StoreError(f"{path} has {size:,} bytes, more than {most:,}: it is not read")
-        arrays: Arrays = load(path.read_bytes())
+        arrays: Arrays = load(read_bytes(path))
     except FileNotFoundError:
         raise
     except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
@@ -189,7 +190,7 @@ def require_finite(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
 def drop_torn_line(path: Path) -> None:
     """Remove the text after the last newline: the next line would be written behind it."""
     if path.exists():
-        content = path.read_bytes()
+        content = read_bytes(path)
         whole = content[: content.rfind(b"\n") + 1]
         if whole != content:
             write_atomically(path, whole)

@@ -84,6 +84,11 @@ class MeteredEnv(LaneEnv):
         except Exception as error:
             raise self._failure(error) from error
         self.returns += rewards
+        if not np.isfinite(self.returns).all():
+            worst = float(rewards[~np.isfinite(self.returns)][0])
+            raise EnvironmentFailure(
+                f"environment '{self.environment_name}' gave a reward of {worst:g}: rewards must be finite numbers"
+            )
         ended = np.flatnonzero(terminated | truncated)
         if ended.size:
             self.finished.append((ended, self.returns[ended].copy(), self._scores(ended, infos)))
@@ -118,15 +123,7 @@ class MeteredEnv(LaneEnv):
     def _scores(self, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return the scores of the episodes that have just ended in the lanes `ended`."""
         if self.score.source == "return":
-            scores = self.returns[ended] / (
-                self.score.max_return if self.score.max_return is not None else 1.0
-            )
-            if not np.isfinite(scores).all():
-                raise EnvironmentFailure(
-                    f"environment '{self.environment_name}' gave an episode the return "
-                    f"{self.returns[ended][~np.isfinite(scores)][0]}: are there rewards that are nan or infinite?"
-                )
-            return scores
+            return self.returns[ended] / (self.score.max_return if self.score.max_return is not None else 1.0)
         if self.score.metric is not None:
             return self._metric(self.score.metric, ended, infos)
         score = infos.get("final_info", {}).get("score")

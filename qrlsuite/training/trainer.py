@@ -506,6 +506,11 @@ class Trainer:
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
         if not self.models.built and self.entry.model.name != specs.NO_MODEL:
             raise _no_network(self.entry)
+        if torch.get_default_dtype() is not torch.float32:
+            raise PluginError(
+                f"the code of {' or '.join(self.entry.third_party()) or 'a plugin'} has set torch's default dtype to "
+                f"{torch.get_default_dtype()} for the whole process: give `dtype` to its own tensors instead"
+            )
         self._informed = asks_for_more(self.algorithm.act)
         self._heeds = asks_for_more(self.algorithm.act, "infos")
         self._remembers = any(population.remembers(module) for module in self.models.built)

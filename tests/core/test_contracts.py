@@ -168,3 +168,12 @@ def test_specs_know_the_kinds_of_actions() -> None:
     assert spec.actions == tuple(actions.KINDS)
     with pytest.raises(PluginError, match=", ".join(actions.KINDS)):
         replace(spec, actions=("continuous",))
+
+
+def test_a_plugin_that_changes_torchs_dtype_for_the_whole_process_is_refused(tiny_task: str) -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(PluginError, match=r"torch's default dtype to torch\.float64"):
+            Trainer(resolve(tiny_task, "mlp"), [0])
+    finally:
+        torch.set_default_dtype(torch.float32)

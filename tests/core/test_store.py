@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import threading
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
@@ -28,6 +31,19 @@ def test_a_torn_last_line_is_dropped_and_a_broken_one_named(tmp_path: Path) -> N
     path.write_bytes(b'{"epoch":1}\n{"ep\n{"epoch":3}\n')
     with pytest.raises(StoreError, match="line 2: not JSON"):
         store.read_lines(path)
+
+
+@pytest.mark.parametrize("read", [store.read_json, store.read_lines, store.read_table, store.read_arrays])
+def test_a_pipe_in_the_place_of_a_file_is_refused(read: Callable[[Path], object], tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    handle = os.open(path, os.O_RDWR)
+    writer = threading.Timer(5, os.close, (handle,))  # a reader that waits goes on then
+    writer.start()
+    with pytest.raises(StoreError, match="not a regular file"):
+        read(path)
+    writer.cancel()
+    os.close(handle)
 
 
 def test_float32_scores_survive_every_round_trip(tmp_path: Path) -> None:

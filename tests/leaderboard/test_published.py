@@ -291,11 +291,19 @@ RERUNS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "before": (lambda f: rewrite(f / "seeds.parquet", added("before")), "score before training"),
     "parameters": (lambda f: rewrite(f / "seeds.parquet", added("parameters")), "initial parameters"),
     "episodes": (lambda f: rewrite(f / "seeds.parquet", added("episodes")), "first epoch's"),
-    "counts": (
-        lambda f: edit(f, lambda r: r["published"]["parameters"].update(classical=3, quantum=1)),
-        "its record has parameters {'classical': 3, 'quantum': 1",
-    ),
 }
+
+
+@pytest.mark.parametrize("agents", [True, False])
+def test_other_numbers_of_parameters_are_found_without_training(
+    agents: bool, runs: Path, tmp_path: Path
+) -> None:
+    folder = publish(runs, tmp_path / "out", agents=agents)
+    assert verify.verify(folder).ok
+    edit(folder, lambda record: record["published"]["parameters"].update(classical=3))
+    verdict = verify.verify(folder)
+    assert not verdict.ok
+    assert "its record has parameters {'classical': 3, " in verdict.message
 
 
 @pytest.mark.parametrize("case", RERUNS)
