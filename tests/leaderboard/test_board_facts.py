@@ -75,14 +75,11 @@ def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
     rows = [("best one", 1, False), ("poor one", None, True), ("poor two", None, True)]
     assert [(row.entry.label, row.tier, row.not_reached) for row in section.tiers] == rows
     assert [row.outperformed_by for row in section.tiers[1:]] == [("best one",)] * 2
-    rows = mostly_at_the_cap.as_dict()["sections"][0]["rows"]
-    assert [row["verdict"].partition(":")[0] for row in rows] == ["ranked", "not reached", "not reached"]
     text = paper(mostly_at_the_cap)
     assert "| not reached | poor one |" in text
-    for shown in (text, report.render(mostly_at_the_cap)):
-        assert "not reached: at the cap in every cell" in shown
+    assert "not reached: at the cap in every cell" in text
     written = [row["verdict"] for row in csv.DictReader(io.StringIO(csv_rows(mostly_at_the_cap.flat())))]
-    assert written == [row["verdict"] for row in rows]
+    assert [verdict.partition(":")[0] for verdict in written] == ["ranked", "not reached", "not reached"]
 
 
 def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.Leaderboard) -> None:
@@ -91,9 +88,6 @@ def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.
     most = "significantly fewer samples in 7 of 49 cells, significantly more in none; both at the cap in 42"
     assert compare_entries(one, two).sentence == neither
     assert compare_entries(best, two).sentence == f"outperforms: {most}"
-    page = report.render(mostly_at_the_cap)
-    assert neither in page
-    assert most in page
 
 
 def test_a_tier_says_on_how_few_cells_it_rests() -> None:
@@ -105,10 +99,6 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
     assert first.rests_on is None
     assert second.rests_on == steps.Support("best one", "later one", cells=7, at_cap=42, total=49)
     assert re.search(r"\| 2 \| later one \| [^|]* \| 7 of 7 \|", paper(made))
-    (row,) = [r for r in csv.DictReader(io.StringIO(csv_rows(made.flat()))) if r["tier"] == "2"]
-    assert (row["rests_on_cells"], row["rests_on_at_cap"], row["rests_on_total"]) == ("7", "42", "49")
-    (told,) = [r["rests_on"] for r in made.as_dict()["sections"][0]["rows"] if r["tier"] == 2]
-    assert json.loads(json.dumps(told))["cells"] == 7
     page = report.render(made)
     assert ">7 of 7</abbr>" in page
     assert "best one outperforms the other entry." in page
@@ -128,8 +118,6 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     assert f"† {note}" in markdown(made)
     assert f"| {entries[0].label} † |" in markdown(made)
     assert f"{entries[0].label}</a> †" in report.render(made)
-    rows = list(csv.DictReader(io.StringIO(csv_rows(made.flat()))))
-    assert [row["tuned_on_protocol_seeds"] for row in rows] == ["True", "False"]
     assert "protocol seeds, which" not in markdown(boards.of(entries))
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from qrlsuite import api
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard.boards import pair
 from qrlsuite.leaderboard.boards.compared import compare_entries, pair_table
@@ -146,22 +145,6 @@ def test_numbers_in_a_label_are_never_cut_by_a_narrow_terminal() -> None:
     assert "width=16   width=64" in shown
     for cells in compared.pair.rows():
         assert all(cell in shown for cell in cells), cells
-
-
-@pytest.mark.parametrize(
-    "order", [("vqc-native qubits=10", "mlp width=16"), ("mlp width=16", "vqc-native qubits=10")]
-)
-def test_published_entries_in_words(order: tuple[str, str]) -> None:
-    compared = api.compare(*order, task="beam6g", published=True, runs="none")
-    assert compared.verdict == (
-        "vqc-native qubits=10 needs 32% fewer steps than mlp width=16 (27% to 37%, 100 seeds each, p < .0001)"
-    )
-    assert compared.among is not None
-    assert compared.among.n_entries == 11
-    values = compared.as_dict()
-    assert values["verdict"] == compared.verdict
-    assert values["board"]["direction"] == ("needs fewer" if order[0].startswith("vqc") else "needs more")
-    assert len(values["times"]["by_threshold"]) == 7
 
 
 def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:

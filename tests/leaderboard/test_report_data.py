@@ -67,13 +67,6 @@ def test_a_page_agrees_with_its_board() -> None:
         assert {labels[other] for other in np.flatnonzero(beats[place])} == set(wins[label])
 
 
-def test_a_pair_speaks_from_both_sides() -> None:
-    made = boards.of([boards.entry("fast", speed=2), boards.entry("slow", speed=0.5)])
-    pair = judge(made.sections[0]).pairs[0]
-    assert pair.words(0).startswith("outperforms: significantly fewer samples in ")
-    assert pair.words(1).startswith("is outperformed: significantly more samples in ")
-
-
 def test_arcs_that_a_chain_stands_for_are_left_out() -> None:
     chain = np.triu(np.ones((4, 4), dtype=bool), 1)
     drawn = ladder.draw(chain, [1, 2, 3, 4])
@@ -119,13 +112,6 @@ def test_packed_curves_read_back(count: int) -> None:
 
 def test_what_is_not_a_number_is_packed_as_missing() -> None:
     assert encode.pack(np.array([np.nan, 0.0, np.inf]), 0.0, 1.0) == "//AA//"
-
-
-def test_thinned_runs_span_the_last_scores() -> None:
-    curves = np.random.default_rng(0).random((40, 3))
-    kept = encode.thinned(curves, 5)
-    assert kept.shape == (5, 3)
-    assert {kept[:, -1].min(), kept[:, -1].max()} == {curves[:, -1].min(), curves[:, -1].max()}
 
 
 def test_a_large_board_carries_a_selection_of_runs(monkeypatch: pytest.MonkeyPatch) -> None:

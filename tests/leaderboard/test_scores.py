@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 
 import numpy as np
@@ -12,7 +10,6 @@ import pytest
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards.scores import rank_by_score
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from tests.commands import say
 from tests.leaderboard.test_pair import entry, spread
 
 
@@ -51,14 +48,3 @@ def test_bad_input_is_one_error() -> None:
         rank_by_score(both()[2:], 200_000)
     with pytest.raises(OptionError, match="not a whole number of epochs"):
         rank_by_score(both(), 2_001)
-
-
-def test_the_board_ranks_by_score_and_what_is_shown_changes_no_rank() -> None:
-    words = ["leaderboard", "--published", "--runs", "none", "--task", "beam6g", "--by", "score"]
-    (whole,) = json.loads(say(*words, "--format", "json").stdout)["sections"]
-    assert len(whole["entries"]) == 11
-    assert whole["entries"][-1]["label"] == "ddqn mlp width=16"
-    low, high = whole["entries"][-1]["ranks"]
-    shown = say(*words, "--entry", "mlp width=16", "--format", "csv").stdout
-    (row,) = csv.DictReader(io.StringIO(shown))
-    assert (row["rank"], row["rank_worst"]) == (str(low), str(high))
