@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.leaderboard.report.encode import clean
@@ -25,96 +24,29 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 12, 12, 38
 """Margins around the plot, in the picture's units."""
 
 
-@dataclass(frozen=True)
-class PairLine:
-    """A pair of the table, with the color of its line in the picture, and the question that it answers, if any."""
+def view(state: State) -> dict[str, Any]:
+    """Return the parts of a study with looks that the template shows; texts of strangers are cleaned.
 
-    color: int
-    question: str
-    pair: str
-    verdict: str
-    seeds: int
-    difference: str
-    interval: str
-    needs: str
-
-
-@dataclass(frozen=True)
-class LookLine:
-    """A look: seeds of each entry, when it was taken, the share of alpha spent by then, its level, p of every pair.
-
-    Attributes
-    ----------
-    p:
-        For each pair its p, empty where it was closed before or the look was not taken; and whether it decided.
+    `pairs` are rows of the table of verdicts; `looks` rows of seeds, when, alpha spent by then, its level, and of each
+    pair p (empty where it was closed before, or the look was not taken) and whether it decided.
     """
-
-    seeds: int
-    taken: str
-    spent: str
-    level: str
-    p: tuple[tuple[str, bool], ...]
-
-
-@dataclass(frozen=True)
-class LooksPicture:
-    """p of every pair at each look, upwards by -log10, and the levels: SVG coordinates.
-
-    Attributes
-    ----------
-    band:
-        Points of the area between the levels while all pairs are open and while one is.
-    seeds, powers:
-        Ticks: position and text.
-    lines:
-        For each pair with a look: its color, the points of its line, and its dots (x, y, decided).
-    """
-
-    band: str
-    seeds: tuple[tuple[float, int], ...]
-    powers: tuple[tuple[float, str], ...]
-    lines: tuple[tuple[int, str, tuple[tuple[float, float, bool], ...]], ...]
-
-
-@dataclass(frozen=True)
-class StudyView:
-    """A study with looks, ready for the template."""
-
-    name: str
-    question: str
-    facts: tuple[tuple[str, str], ...]
-    note: str
-    pairs: tuple[PairLine, ...]
-    looks: tuple[LookLine, ...]
-    picture: LooksPicture
-
-
-def view(outcome: State) -> StudyView:
-    """Return a study with its decisions for the template."""
-    study = outcome.study
-    plain = outcome.as_dict()
-    pairs = tuple(
-        PairLine(
-            color=index,
-            question=clean(facts["question"] or "", 300),
-            pair=clean(versus(pair)),
-            verdict=clean(outcome.verdict(pair)),
-            seeds=pair.n_runs,
-            difference=difference_text(pair, study.grid)[0].replace("-", "−"),
-            interval=difference_text(pair, study.grid)[1].replace("-", "−"),
-            needs=needs_text(outcome, facts["needs"]).replace("<=", "≤"),
-        )
-        for index, (pair, facts) in enumerate(zip(outcome.pairs, plain["pairs"]))
-    )
-    return StudyView(
-        name=clean(study.name),
-        question=clean(study.file.summary, 300),
-        facts=tuple((term, clean(value, 600)) for term, value in _facts(outcome, plain)),
-        note=". ".join(filter(None, (clean(reason_note(study), 600), horizon_note(outcome)))),
-        pairs=pairs,
-        looks=tuple(_look(outcome, index) for index in range(len(study.design.looks))),
-        picture=_picture(outcome),
-    )
+    study, facts = state.study, state.as_dict()
+    pairs = []
+    for pair, each in zip(state.pairs, facts["pairs"]):
+        difference, interval = (text.replace("-", "−") for text in difference_text(pair, study.grid))
+        needs = needs_text(state, each["needs"]).replace("<=", "≤")
+        names = {"question": clean(each["question"] or "", 300), "pair": clean(versus(pair))}
+        row = {"verdict": clean(state.verdict(pair)), "seeds": pair.n_runs, "needs": needs}
+        pairs.append({**names, **row, "difference": difference, "interval": interval})
+    return {
+        "name": clean(study.name),
+        "question": clean(study.file.summary, 300),
+        "facts": [(term, clean(value, 600)) for term, value in _facts(state, facts)],
+        "note": ". ".join(filter(None, (clean(reason_note(study), 600), horizon_note(state)))),
+        "pairs": pairs,
+        "looks": [_look(state, index) for index in range(len(study.design.looks))],
+        "picture": _picture(state),
+    }
 
 
 def _facts(outcome: State, plain: dict[str, Any]) -> list[tuple[str, str]]:
@@ -147,7 +79,7 @@ def _facts(outcome: State, plain: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _look(outcome: State, index: int) -> LookLine:
+def _look(outcome: State, index: int) -> dict[str, Any]:
     design, taken = outcome.study.design, outcome.taken
     seeds = design.looks[index]
     spent = 2 * design.spending.spent([seeds / design.looks[-1]], design.alpha / 2)[0]
@@ -156,16 +88,21 @@ def _look(outcome: State, index: int) -> LookLine:
         has_p = index < len(pair.p)
         last = index == len(pair.p) - 1
         cells.append((p_text(pair.p[index]) if has_p else "", has_p and last and pair.differs))
-    return LookLine(
-        seeds=seeds,
-        taken=_minute(taken[seeds]) if seeds in taken else "–",
-        spent=f"{spent:.3f}",
-        level=f"{design.level(index, len(design.family)):.4f}",
-        p=tuple(cells),
-    )
+    return {
+        "seeds": seeds,
+        "taken": _minute(taken[seeds]) if seeds in taken else "–",
+        "spent": f"{spent:.3f}",
+        "level": f"{design.level(index, len(design.family)):.4f}",
+        "p": cells,
+    }
 
 
-def _picture(outcome: State) -> LooksPicture:
+def _picture(outcome: State) -> dict[str, Any]:
+    """Return p of every pair at each look, upwards by -log10, and the levels, in coordinates of an SVG.
+
+    `band` is the area between the levels while all pairs are open and while one is, `seeds` and `powers` are ticks, and
+    `lines` has of each pair its color, the points of its line, and its dots (x, y, decided).
+    """
     design = outcome.study.design
     looks = range(len(design.looks))
     strict = [design.level(look, len(design.family)) for look in looks]
@@ -190,14 +127,12 @@ def _picture(outcome: State) -> LooksPicture:
         )
         if dots:
             lines.append((color, " ".join(f"{a},{b}" for a, b, _ in dots), dots))
-    return LooksPicture(
-        band=f"{points(strict, looks)} {points(loose, looks[::-1])}",
-        seeds=tuple((x(seeds), seeds) for seeds in design.looks),
-        powers=tuple(
-            (y(10.0**-power), "1" if power == 0 else f"{10.0**-power:g}") for power in range(top + 1)
-        ),
-        lines=tuple(lines),
-    )
+    return {
+        "band": f"{points(strict, looks)} {points(loose, looks[::-1])}",
+        "seeds": [(x(seeds), seeds) for seeds in design.looks],
+        "powers": [(y(10.0**-power), "1" if power == 0 else f"{10.0**-power:g}") for power in range(top + 1)],
+        "lines": lines,
+    }
 
 
 def _minute(when: str) -> str:

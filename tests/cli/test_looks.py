@@ -690,10 +690,10 @@ def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
     )
     assert "at the horizon" not in say("show", "quantum-or-not").stdout
     page = looks_report.view(outcome)
-    assert [line.verdict.endswith(", at the horizon") for line in page.pairs] == [
+    assert [line["verdict"].endswith(", at the horizon") for line in page["pairs"]] == [
         pair["at_horizon"] for pair in pairs.values()
     ]
-    assert "neither had the time to learn" in page.note
+    assert "neither had the time to learn" in page["note"]
 
 
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:

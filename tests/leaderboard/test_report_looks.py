@@ -61,23 +61,25 @@ def test_a_study_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) -
     assert refused == []
     three, two = (looks_report.view(outcome) for outcome in found)
     verdicts = ["equal within 10 percent", "mlp width=16 needs fewer", "mlp width=8 needs fewer"]
-    assert [line.verdict for line in three.pairs] == verdicts
+    assert [line["verdict"] for line in three["pairs"]] == verdicts
     taken = [(20, True), (40, True), (60, False), (80, False), (100, False)]
-    assert [(line.seeds, line.taken != "–") for line in three.looks] == taken
+    assert [(line["seeds"], line["taken"] != "–") for line in three["looks"]] == taken
     # Pocock's spending at a fifth of the runs: alpha x log(1 + (e - 1) / 5)
-    assert [line.spent for line in three.looks] == ["0.015", "0.026", "0.035", "0.043", "0.050"]
-    assert [bool(text) for text, _ in three.looks[1].p] == [True, False, False], "the others were closed"
-    assert [decided for _, decided in three.looks[0].p] == [False, True, True]
-    facts = dict(three.facts)
+    assert [line["spent"] for line in three["looks"]] == ["0.015", "0.026", "0.035", "0.043", "0.050"]
+    assert [bool(text) for text, _ in three["looks"][1]["p"]] == [True, False, False], (
+        "the others were closed"
+    )
+    assert [decided for _, decided in three["looks"][0]["p"]] == [False, True, True]
+    facts = dict(three["facts"])
     assert facts["State"] == "finished"
     assert facts["Hash of the study"] == found[0].study.hash
     assert facts["Study written"].endswith(" UTC")
     assert facts["First seed begun"] >= facts["Study written"]
     assert facts["Seeds"] == "10000:10100, 100 used, 200 saved"
-    assert dict(two.facts)["State"] == "goes on: next look at 40 seeds"
-    assert "p ≤ 0.015 at 40 seeds" in two.pairs[0].needs
-    assert len(three.picture.lines) == 3
-    assert [len(dots) for _, _, dots in three.picture.lines] == [2, 1, 1]
+    assert dict(two["facts"])["State"] == "goes on: next look at 40 seeds"
+    assert "p ≤ 0.015 at 40 seeds" in two["pairs"][0]["needs"]
+    assert len(three["picture"]["lines"]) == 3
+    assert [len(dots) for _, _, dots in three["picture"]["lines"]] == [2, 1, 1]
     other, _ = in_folder(runs, ["beam6g"])
     assert other == []
 
