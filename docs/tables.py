@@ -26,7 +26,7 @@ from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import read
 from qrlsuite.results.text import hours_text, interval_text, mean_text, steps_text
 from qrlsuite.studies.state import State, by_question, difference_text, versus
-from qrlsuite.studies.together import StudiesTogether
+from qrlsuite.studies.together import together
 from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
@@ -94,13 +94,12 @@ def entries(outcome: State) -> Rows:
             )
 
 
-def together(names: str) -> Rows:
+def of_several(names: str) -> Rows:
     """The pairs that several studies share, on average over their tasks."""
-    read = StudiesTogether(tuple(map(published, names.split("+"))))
-    for place, sheet in enumerate(part for part in read.parts() if isinstance(part, Sheet)):
-        if not place:
-            yield [column.title for column in sheet.columns]
-        yield from sheet.cells
+    read = together([published(name) for name in names.split("+")])
+    sheet = Sheet("", read.columns(), read.pairs)
+    yield [column.title for column in sheet.columns]
+    yield from sheet.cells
 
 
 def means(names: str) -> Rows:
@@ -115,7 +114,7 @@ def means(names: str) -> Rows:
         yield f"`{outcome.study.task}`", counts, *steps
 
 
-OF_SEVERAL: dict[str, Callable[[str], Rows]] = {"together": together, "means": means}
+OF_SEVERAL: dict[str, Callable[[str], Rows]] = {"together": of_several, "means": means}
 
 
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:

@@ -25,7 +25,7 @@ from qrlsuite.studies.looks import StudyWithLooks, has_begun
 from qrlsuite.studies.runner import Overview
 from qrlsuite.studies.state import State
 from qrlsuite.studies.study import EvaluationSection, Member, PictureSection, Study, load
-from qrlsuite.studies.together import StudiesTogether
+from qrlsuite.studies.together import together
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -246,7 +246,7 @@ def _of_looks(kind: str, names: Sequence[str], runs: Path) -> Composed:
     if len(outcomes) > 1 and kind != "pairs":
         raise OptionError(f"picture '{kind}' shows one study: leave {', '.join(names[1:])} out")
     if len(outcomes) > 1:
-        return Composed(drawing.draw_together(StudiesTogether(tuple(outcomes))))
+        return Composed(drawing.draw_together(together(outcomes)))
     return Composed(drawing.draw(outcomes[0]) if kind == "pairs" else drawing.draw_entries(outcomes[0]))
 
 

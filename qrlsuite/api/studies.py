@@ -33,7 +33,7 @@ from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.runner import Overview
 from qrlsuite.studies.state import State
 from qrlsuite.studies.study import Member, Study
-from qrlsuite.studies.together import StudiesTogether
+from qrlsuite.studies.together import StudiesTogether, together
 
 ALL = "all"
 """In the place of a study's name: every registered one."""
@@ -135,7 +135,7 @@ def read_study(
         If its results are damaged, or were changed after a look.
     """
     if more:
-        return StudiesTogether(tuple(_outcome(each, Path(runs)) for each in (name, *more)))
+        return together([_outcome(each, Path(runs)) for each in (name, *more)])
     study, folder = studies.find(name), Path(runs)
     if study.file.looks is not None:
         return studies.read_outcome(name, folder)

@@ -7,14 +7,14 @@ first look count here: every pair has them, whatever they showed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from qrlsuite.columns import Column, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed
@@ -37,21 +37,18 @@ class SharedPair:
     question:
         The question that it answers in the first study; may be empty.
     ratio:
-        How many more steps the second entry needs, on each task and on average.
-    p:
-        Adjusted for all pairs (Holm).
+        How many more steps the second entry needs, on each task and on average; p is adjusted for all pairs (Holm).
     """
 
     question: str
     first: str
     second: str
     ratio: MeanRatio
-    p: float
 
     @property
     def verdict(self) -> str:
         """Which entry needs fewer steps on average over the tasks, if that is significant."""
-        if self.p > ALPHA:
+        if self.ratio.p > ALPHA:
             return "not told apart"
         return f"{self.first if self.ratio.difference > 0 else self.second} needs fewer"
 
@@ -61,32 +58,18 @@ class StudiesTogether(Shown):
     """Several studies with looks, each of a task of its own, which compare entries of the same names.
 
     Entries of one name may have other options on another task: for example, options that were tuned for it.
+
+    Attributes
+    ----------
+    pairs:
+        The pairs that all studies compare and that have a ratio, in the order of the first study.
+    left_out:
+        One line for each pair that has no ratio.
     """
 
     studies: tuple[State, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.studies) < 2:
-            raise OptionError("a mean over tasks needs two studies or more")
-        for place, study in enumerate(self.studies):
-            if study.study.task in self.tasks[:place]:
-                raise OptionError(f"two studies are of task '{study.study.task}': give one of each task")
-            if any(self._lacking(study)):
-                raise OptionError(
-                    f"study '{study.study.name}' has not taken its first look: qrlsuite study run {study.study.name}"
-                )
-        if not self._named:
-            names = listed([each.study.name for each in self.studies])
-            raise OptionError(
-                f"{names} have no pair of entries in common: pairs are matched by the entries' names"
-            )
-
-    @property
-    def name(self) -> str:
-        """The words that are in all names of the studies, as the first has them, or the first study's name."""
-        first, *others = (study.study.name.split("-") for study in self.studies)
-        common = [word for word in first if all(word in other for other in others)]
-        return "-".join(common or first)
+    pairs: tuple[SharedPair, ...]
+    left_out: tuple[str, ...]
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -98,62 +81,38 @@ class StudiesTogether(Shown):
         """Numbers of seeds that count on each task: the seeds of the study's first look."""
         return tuple(each.study.design.looks[0] for each in self.studies)
 
-    @staticmethod
-    def _lacking(outcome: State) -> Iterator[str]:
-        """Yield the entries that lack seeds of the first look."""
-        for name in outcome.study.entries:
-            curves = outcome.curves.get(name)
-            if curves is None or len(curves.values) < outcome.study.design.looks[0]:
-                yield name
-
-    @cached_property
-    def _named(self) -> list[tuple[str, str, str]]:
-        """Question, first and second entry of each pair that all studies have."""
-        have = [{frozenset(pair) for pair in each.study.design.family} for each in self.studies]
-        first = self.studies[0]
-        return [
-            (asked, pair.first, pair.second)
-            for asked, pairs in by_question(first.study, first.pairs)
-            for pair in pairs
-            if all(frozenset((pair.first, pair.second)) in family for family in have)
-        ]
-
-    def _times(self, outcome: State, name: str) -> IntArray:
-        """Return an entry's times below each threshold at the first look, (N, E)."""
-        curves = outcome.curves[name]
-        seeds = outcome.study.design.looks[0]
-        return times_below(curves.values[:seeds], outcome.study.grid, curves.steps_per_epoch)
-
-    @cached_property
-    def _ratios(self) -> dict[tuple[str, str, str], MeanRatio | str]:
-        """The mean ratio of each pair, or why it has none."""
-        found: dict[tuple[str, str, str], MeanRatio | str] = {}
-        for named in self._named:
-            _, first, second = named
-            times = [(self._times(each, first), self._times(each, second)) for each in self.studies]
-            try:
-                found[named] = mean_ratio(times)
-            except OptionError as error:
-                found[named] = f"{first} / {second}: {error}"
-        return found
-
-    @cached_property
-    def pairs(self) -> tuple[SharedPair, ...]:
-        """The pairs that all studies compare and that have a ratio, in the order of the first study."""
-        known = {named: ratio for named, ratio in self._ratios.items() if not isinstance(ratio, str)}
-        adjusted = holm(np.array([ratio.p for ratio in known.values()])).tolist()
-        return tuple(SharedPair(*named, ratio, p) for (named, ratio), p in zip(known.items(), adjusted))
-
-    @property
-    def left_out(self) -> list[str]:
-        """One line for each pair that has no ratio."""
-        return [each for each in self._ratios.values() if isinstance(each, str)]
-
     @property
     def changed(self) -> list[str]:
         """The entries of shared pairs whose options are not the same on all tasks, in order."""
         names = dict.fromkeys(name for pair in self.pairs for name in (pair.first, pair.second))
-        return [name for name in names if len({_configuration(each, name) for each in self.studies}) > 1]
+        keys = ("algorithm", "algorithm_options", "model", "model_options")
+        identities = {name: [each.study.entries[name].identity for each in self.studies] for name in names}
+        return [
+            name for name in names if len({repr([i.get(key) for key in keys]) for i in identities[name]}) > 1
+        ]
+
+    def columns(self) -> tuple[Column[SharedPair], ...]:
+        """Return the columns; a row is a pair."""
+
+        def mean(pair: SharedPair) -> str:
+            return interval_text(percent, pair.ratio.difference, *pair.ratio.interval)
+
+        def on(place: int, task: str) -> Column[SharedPair]:
+            return Column("", lambda pair: pair.ratio.differences[place], percent, head=task)
+
+        return (
+            Column("question", lambda pair: pair.question or None),
+            Column("first", lambda pair: pair.first),
+            Column("second", lambda pair: pair.second),
+            Column("", lambda pair: f"{pair.first} / {pair.second}", str, head="pair: A / B", words=True),
+            Column("verdict", lambda pair: pair.verdict, str, words=True),
+            Column("difference", lambda pair: pair.ratio.difference, head="mean (95%)", cell=mean),
+            Column("interval", lambda pair: list(pair.ratio.interval)),
+            Column("p", lambda pair: pair.ratio.p, p_text),
+            Column("left_out", lambda pair: list(pair.ratio.left_out), _span, head="one left out"),
+            Column("differences", lambda pair: dict(zip(self.tasks, pair.ratio.differences))),
+            *(on(place, task) for place, task in enumerate(self.tasks)),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -163,70 +122,78 @@ class StudiesTogether(Shown):
             "seeds": list(self.seeds),
             "alpha": ALPHA,
             "changed": self.changed,
-            "left_out": self.left_out,
-            "pairs": [
-                {
-                    "question": pair.question or None,
-                    "first": pair.first,
-                    "second": pair.second,
-                    "verdict": pair.verdict,
-                    "p": pair.p,
-                    "difference": pair.ratio.difference,
-                    "interval": list(pair.ratio.interval),
-                    "left_out": list(pair.ratio.left_out),
-                    "differences": dict(zip(self.tasks, pair.ratio.differences)),
-                }
-                for pair in self.pairs
-            ],
+            "left_out": list(self.left_out),
+            "pairs": [record(self.columns(), pair) for pair in self.pairs],
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show `parts`."""
-        yield from self.parts()
-
-    def parts(self) -> Iterator[Text | Sheet]:
-        """Return the parts of a screen: a table for each question, with explanations."""
+        """Show a table for each question, with explanations."""
         names = ", ".join(each.study.name for each in self.studies)
         yield Text(f"{names}: B against A, on each task and on average", style="bold")
-        questions = list(dict.fromkeys(pair.question for pair in self.pairs))
-        for asked in questions:
-            if asked:
-                yield Text(asked, style="bold")
-            yield self._sheet([pair for pair in self.pairs if pair.question == asked])
-        seeds = ", ".join(map(str, self.seeds))
+        for asked in dict.fromkeys(pair.question for pair in self.pairs):
+            yield from [Text(asked, style="bold")] * bool(asked)
+            yield Sheet("", self.columns(), [pair for pair in self.pairs if pair.question == asked])
         yield Text(
             "B against A: how many more steps B needs (+52% = B is slower), by the first look's seeds of each study "
-            f"({seeds}), which no early stop can bias; mean: of the ratios, over these {len(self.tasks)} tasks, with a "
-            "95% interval by itself; one left out: the least and the greatest mean without one of the tasks; verdict: "
-            f"error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). Tasks are fixed, only seeds are drawn: "
-            "nothing follows for other tasks."
+            f"({', '.join(map(str, self.seeds))}), which no early stop can bias; mean: of the ratios, over these "
+            f"{len(self.tasks)} tasks, with a 95% interval by itself; one left out: the least and the greatest mean "
+            f"without one of the tasks; verdict: error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). "
+            "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
         )
         yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
             yield Text(f"entries with other options on another task: {', '.join(self.changed)}")
 
-    def _sheet(self, pairs: Sequence[SharedPair]) -> Sheet:
-        """Return the table of some pairs."""
-        heads = ("pair: A / B", "verdict", "mean (95%)", "p", "one left out", *self.tasks)
-        rows = [
-            (
-                f"{pair.first} / {pair.second}",
-                pair.verdict,
-                interval_text(percent, pair.ratio.difference, *pair.ratio.interval),
-                p_text(pair.p),
-                _span(pair.ratio.left_out),
-                *map(percent, pair.ratio.differences),
-            )
-            for pair in pairs
-        ]
-        return Sheet.of("", heads, rows, words=heads[:2])
+
+def together(studies: Sequence[State]) -> StudiesTogether:
+    """Compare the pairs that several studies share, on average over their tasks.
+
+    Raises
+    ------
+    OptionError
+        If two studies have one task, one lacks its first look, or they share no pair.
+    """
+    seen: set[str] = set()
+    for each in studies:
+        if each.study.task in seen:
+            raise OptionError(f"two studies are of task '{each.study.task}': give one of each task")
+        seen.add(each.study.task)
+        first_look = each.study.design.looks[0]
+        if any(len(each.seeds[name]) < first_look for name in each.study.entries):
+            name = each.study.name
+            raise OptionError(f"study '{name}' has not taken its first look: qrlsuite study run {name}")
+    pairs, ratios, left_out = list(_shared(studies)), list[tuple[str, str, str, MeanRatio]](), list[str]()
+    if not pairs:
+        names = listed([each.study.name for each in studies])
+        raise OptionError(
+            f"{names} have no pair of entries in common: pairs are matched by the entries' names"
+        )
+    for asked, first, second in pairs:
+        try:
+            ratio = mean_ratio([(_times(each, first), _times(each, second)) for each in studies])
+        except OptionError as error:
+            left_out.append(f"{first} / {second}: {error}")
+        else:
+            ratios.append((asked, first, second, ratio))
+    adjusted = holm(np.array([ratio.p for *_, ratio in ratios])).tolist()
+    found = [SharedPair(*names, replace(ratio, p=p)) for (*names, ratio), p in zip(ratios, adjusted)]
+    return StudiesTogether(tuple(studies), tuple(found), tuple(left_out))
 
 
-def _configuration(outcome: State, name: str) -> str:
-    """Return an entry's algorithm and model with all their options as text, whatever the task."""
-    identity = outcome.study.entries[name].identity
-    return repr([identity.get(key) for key in ("algorithm", "algorithm_options", "model", "model_options")])
+def _shared(studies: Sequence[State]) -> Iterator[tuple[str, str, str]]:
+    """Yield question, first and second entry of each pair that all studies have, in the order of the first study."""
+    families = [{frozenset(pair) for pair in each.study.design.family} for each in studies]
+    for asked, pairs in by_question(studies[0].study, studies[0].pairs):
+        for pair in pairs:
+            if all(frozenset((pair.first, pair.second)) in family for family in families):
+                yield asked, pair.first, pair.second
 
 
-def _span(ends: tuple[float, float]) -> str:
+def _times(state: State, name: str) -> IntArray:
+    """Return an entry's times below each threshold at the first look, (N, E)."""
+    curves = state.curves[name]
+    return times_below(curves.values[: state.study.design.looks[0]], state.study.grid, curves.steps_per_epoch)
+
+
+def _span(ends: Sequence[float]) -> str:
     return " to ".join(map(percent, ends))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +12,7 @@ import pytest
 from qrlsuite import api
 from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.statistics.sequential import Decided
-from qrlsuite.studies.state import State
-from qrlsuite.studies.together import StudiesTogether
+from qrlsuite.studies.together import StudiesTogether, together
 from tests.commands import answer, say
 
 TOGETHER = ("quantum-or-not", "quantum-or-not-degree5", "quantum-or-not-a3-0")
@@ -61,12 +59,6 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
     assert drawn.read_bytes().startswith(b"\x89PNG")
     read = api.read_study(*TOGETHER)
     assert isinstance(read, StudiesTogether)
-    some = api.read_study("equal-size-pulse", "equal-size-vqe-h2")
-    assert isinstance(some, StudiesTogether)
-    assert some.name == "equal-size", "the words that names share"
-    some = api.read_study("equal-size-beam6g-ppo", "equal-size-cartpole-ppo")
-    assert isinstance(some, StudiesTogether)
-    assert some.name == "equal-size-ppo"
     [axes] = drawing.draw_together(read).axes
     names = [label.get_text() for label in axes.get_yticklabels()]
     lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}
@@ -95,17 +87,13 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
     assert unbounded.interval == (-1.0, math.inf)
 
 
-def test_a_pair_without_a_ratio_is_left_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pair_without_a_ratio_is_left_out_alone() -> None:
     outcomes = [api.read_study(name) for name in TOGETHER[1:]]
-    assert all(isinstance(each, State) for each in outcomes)
-    read = StudiesTogether(tuple(outcomes))  # type: ignore[arg-type]
-    times = StudiesTogether._times
-
-    def never_below(self: Any, outcome: Any, name: str) -> Any:
-        return times(self, outcome, name) * (name != "sine 44")
-
-    monkeypatch.setattr(StudiesTogether, "_times", never_below)
-    assert len(read.pairs) == len(read._named) - 2
+    whole = together(outcomes)  # type: ignore[arg-type]
+    for outcome in outcomes:
+        outcome.curves["sine 44"].values[:] = 1  # below no threshold
+    read = together(outcomes)  # type: ignore[arg-type]
+    assert len(read.pairs) == len(whole.pairs) - 2
     assert [line.partition(":")[0] for line in read.left_out] == ["10 qubits / sine 44", "sine 44 / width 14"]
     assert "left out: 10 qubits / sine 44: " in repr(read)
     assert "left out: 10 qubits / sine 44: " in " ".join(drawing.draw_together(read).get_supxlabel().split())

@@ -209,7 +209,7 @@ def test_one_size_on_several_tasks() -> None:
 def test_the_mean_over_tasks_decides_nothing() -> None:
     names = "+".join(f"equal-size-{task}" for task in ONE_SIZE)
     assert f"<!-- table: {names} together -->" in PROSE
-    _, network, sines, mean_field = tables.together(names)
+    _, network, sines, mean_field = tables.of_several(names)
     assert {row[1] for row in (network, sines, mean_field)} == {"not told apart"}
     for part, words in (
         (ONE_SIZE, "the seven give {} ({} to {}, p {})"),
@@ -217,7 +217,7 @@ def test_the_mean_over_tasks_decides_nothing() -> None:
     ):
         row = next(
             row
-            for row in tables.together("+".join(f"equal-size-{task}" for task in part))
+            for row in tables.of_several("+".join(f"equal-size-{task}" for task in part))
             if "network" in row[0]
         )
         values = [
