@@ -21,10 +21,10 @@ from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.studies.looks import StudyWithLooks, has_begun
+from qrlsuite.studies.looks import Study, has_begun
 from qrlsuite.studies.runner import Overview
 from qrlsuite.studies.state import State
-from qrlsuite.studies.study import EvaluationSection, Member, PictureSection, Study, load
+from qrlsuite.studies.study import EvaluationSection, Member, PictureSection, StudyFile, load
 from qrlsuite.studies.together import together
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ OF_LOOKS = ("pairs", "entries")
 """Pictures of a study with looks, which its file need not name."""
 
 
-def find(name: str) -> Study:
+def find(name: str) -> StudyFile:
     """Load a study: registered, one with looks that comes with the suite, a folder with a published one, or a file."""
     registered = registry.load().names(specs.StudySpec)
     if not name.endswith(".toml") and name not in registered:
@@ -44,7 +44,7 @@ def find(name: str) -> Study:
             files = [f"{name}.toml"] if Path(f"{name}.toml").exists() else []
             known = [*files, *registered, *published_studies.names()]
             raise UnknownNameError(f"unknown study '{name}'{nearest(name, files or known)}")
-        return dataclasses.replace(published_studies.load(folder), source=name)
+        return published_studies.load(folder).of(name)
     study = load(name)
     check(study)
     return study
@@ -55,13 +55,13 @@ def read_outcome(name: str, runs: Path) -> State:
     found, folder = find(name), published_studies.folder_of(name)
     if folder is not None and (folder == Path(name) or not has_begun(runs, found.name)):
         return published_studies.read(folder)
-    return StudyWithLooks(found, runs).read()
+    return Study(found, runs).read()
 
 
-def check(study: Study) -> None:
+def check(study: StudyFile) -> None:
     """Check that a study's pictures exist and take its settings."""
-    for place, picture in enumerate(study.file.pictures):
-        location = f"{study.source}: pictures.{place}"
+    for place, picture in enumerate(study.pictures):
+        location = f"{study.origin}: pictures.{place}"
         if picture.kind not in pictures.KINDS:
             raise UnknownNameError(
                 f"{location}.kind: unknown picture '{picture.kind}'{nearest(picture.kind, pictures.KINDS)}"
@@ -183,15 +183,15 @@ def draw(
     """
     name, *more = names
     study = find(name)
-    named = {section.name: section for section in study.file.pictures}
-    if kind not in named and kind in OF_LOOKS and study.file.looks is not None:
+    named = {section.name: section for section in study.pictures}
+    if kind not in named and kind in OF_LOOKS and study.looks is not None:
         if settings or seeds is not None or horizon is not None:
             raise OptionError(
                 f"picture '{kind}' of a study shows its looks as they are: leave the settings out"
             )
         return _of_looks(kind, names, selection.runs)
     if kind not in named and kind not in pictures.KINDS:
-        known = [*named, *(OF_LOOKS if study.file.looks is not None else ()), *pictures.KINDS]
+        known = [*named, *(OF_LOOKS if study.looks is not None else ()), *pictures.KINDS]
         raise UnknownNameError(f"study '{study.name}' has no picture '{kind}'{nearest(kind, known)}")
     if more:
         raise OptionError(f"picture '{kind}' shows one study: leave {', '.join(more)} out")
@@ -205,7 +205,7 @@ def draw(
     data = pictures.KINDS[section.kind].data
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: {drawn_by(name, section, members, selection.runs)}")
-    folder = selection.runs if study.file.looks is None else read_outcome(name, selection.runs).study.folder
+    folder = selection.runs if study.looks is None else read_outcome(name, selection.runs).study.folder
     entries = list(read(Selection(folder, selection.published and data == "entries"), members).values())
     if not entries:
         hint = "; --published draws the entries that come with the suite"
@@ -224,7 +224,7 @@ def draw(
 
 def next_steps(name: str, found: Overview, runs: Path) -> list[str]:
     """Return a line for each picture of a study: the command that draws it."""
-    return [f"next: {drawn_by(name, picture, found.members, runs)}" for picture in found.study.file.pictures]
+    return [f"next: {drawn_by(name, picture, found.members, runs)}" for picture in found.study.pictures]
 
 
 def drawn_by(name: str, section: PictureSection, members: Sequence[Member], runs: Path) -> str:

@@ -10,7 +10,6 @@ Verdicts are not stored: they are computed from the study and the curves.
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
@@ -19,9 +18,9 @@ from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.export import export as export_entry
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.results.store import EntryStore, write_atomically
-from qrlsuite.studies.looks import FILE, LOG, Curves, StudyWithLooks, in_folder
+from qrlsuite.studies.looks import FILE, LOG, Curves, Study, in_folder
 from qrlsuite.studies.state import State
-from qrlsuite.studies.study import Study, dumps, load_kept
+from qrlsuite.studies.study import StudyFile, dumps, load_kept
 
 PUBLISHED = PLANS
 """The studies with looks that come with the suite."""
@@ -38,10 +37,9 @@ def folder_of(name: str) -> Path | None:
     return next(filter(is_published, known), None)
 
 
-def load(folder: Path) -> Study:
+def load(folder: Path) -> StudyFile:
     """Read the study that a folder holds, without its results."""
-    study = load_kept(folder / FILE)
-    return replace(study, source=str(folder / FILE))
+    return load_kept(folder / FILE).of(str(folder / FILE))
 
 
 def is_published(path: Path) -> bool:
@@ -63,7 +61,7 @@ def read(folder: Path, labels: bool = True) -> State:
         raise StoreError(
             f"{folder} holds no {FILE}: give a study's file, or a folder that `qrlsuite export` wrote"
         )
-    study = StudyWithLooks(load(folder), folder.parent)
+    study = Study(load(folder), folder.parent)
     study.folder = folder
     trained, hours = dict[str, Curves](), dict[str, float]()
     for name, entry in study.entries.items():
@@ -101,7 +99,7 @@ def collected(selection: Selection) -> tuple[list[State], list[str]]:
     return outcomes, refused
 
 
-def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
+def export(study: Study, out: Path, agents: bool = True) -> Path:
     """Write a study and its finished seeds to `out/<name>`; returns that folder.
 
     Exported again while the study goes on, it holds more seeds. No file is replaced by a smaller one, and the study's
@@ -113,7 +111,7 @@ def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
     folder = out / study.name
     if not is_published(folder):
         write_atomically(folder / FILE, dumps(study.file).encode())
-    elif (there := StudyWithLooks(load(folder), out).hash) != study.hash:
+    elif (there := Study(load(folder), out).hash) != study.hash:
         raise OptionError(
             f"{folder} holds another study ({there}, this one is {study.hash}): choose another --out"
         )
@@ -131,7 +129,7 @@ def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
 def import_study(folder: Path, runs: Path) -> list[Imported]:
     """Copy the seeds of a published study to a results folder, where `study run` goes on with it."""
     source = read(folder).study
-    study = StudyWithLooks(load(folder), runs)
+    study = Study(load(folder), runs)
     study.begin()
     done = [
         import_seeds.import_seeds(store, study.folder, source.hash) for store in import_seeds.sources(folder)

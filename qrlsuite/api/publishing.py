@@ -24,7 +24,7 @@ from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.notation import parse_named
 from qrlsuite.results.store import write_atomically
 from qrlsuite.specs import StudySpec
-from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.looks import Study
 
 ALL = "all"
 """In the place of entries: every complete one."""
@@ -95,7 +95,7 @@ def export(
     if not names:
         raise OptionError("name the entries to export, or say `export all`: qrlsuite runs lists them")
     named = {name: studies.find(name) for name in names if not everything and _is_study(name)}
-    with_looks = [study for study in named.values() if study.file.looks is not None]
+    with_looks = [study for study in named.values() if study.looks is not None]
     if 0 < len(named) < len(names) or 0 < len(with_looks) < len(named):
         raise OptionError(
             "export entries, studies and studies with looks by commands of their own: they go to different folders"
@@ -103,7 +103,7 @@ def export(
     if with_looks:
         for study in with_looks:
             target = out or Path("leaderboard/plans")
-            folder = published_studies.export(StudyWithLooks(study, runs), target, agents)
+            folder = published_studies.export(Study(study, runs), target, agents)
             yield Exported(folder=folder)
         return
     selection = Selection.create(runs, tasks).named()

@@ -29,10 +29,10 @@ from qrlsuite.results.store import write_atomically
 from qrlsuite.studies import looks as with_looks
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
-from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.looks import Study
 from qrlsuite.studies.runner import Overview
 from qrlsuite.studies.state import State
-from qrlsuite.studies.study import Member, Study
+from qrlsuite.studies.study import Member, StudyFile
 from qrlsuite.studies.together import StudiesTogether, together
 
 ALL = "all"
@@ -103,7 +103,7 @@ def new_study(
     return outcome
 
 
-def _plugins_of(study: StudyWithLooks, file: Path) -> str:
+def _plugins_of(study: Study, file: Path) -> str:
     """Return the line that names the plugins by path of a study's entries, relative to its file; `""` without any."""
     used = {source.path for entry in study.entries.values() for source in identity.plugins(entry)}
     paths = [Path(os.path.relpath(path, file.absolute().parent)).as_posix() for path in sorted(used)]
@@ -137,7 +137,7 @@ def read_study(
     if more:
         return together([_outcome(each, Path(runs)) for each in (name, *more)])
     study, folder = studies.find(name), Path(runs)
-    if study.file.looks is not None:
+    if study.looks is not None:
         return studies.read_outcome(name, folder)
     members = study.members()
     shown = overview(study, members, folder, Where.create())
@@ -147,7 +147,7 @@ def read_study(
 
 
 def overview(
-    study: Study,
+    study: StudyFile,
     members: Sequence[Member],
     runs: Path,
     where: Where,
@@ -162,7 +162,7 @@ def overview(
 
 def _outcome(name: str, runs: Path) -> State:
     """Read a study that must have looks."""
-    if studies.find(name).file.looks is None:
+    if studies.find(name).looks is None:
         raise OptionError(f"study '{name}' has no looks: only studies with looks are read together")
     return studies.read_outcome(name, runs)
 
@@ -229,7 +229,7 @@ def run_study(
     where = where_of(engine, workers, device, same)
     study = studies.find(name)
     chosen = {"options": options, "models": models, "only": only, "--seeds": seeds, "--epochs": epochs}
-    if study.file.looks is not None:
+    if study.looks is not None:
         require_unchanged(name, chosen)
         return take_looks(study, where, budget, runs, progress)
     [planned], _ = plan(name, options, models, several(only), seeds, epochs, where, runs)
@@ -292,7 +292,7 @@ def train_studies(
     missing.places(works[0].runs, [work.entry for work in works], where, quiet=not progress)
     for each in planned:
         if len(planned) > 1:
-            console.print(f"\nstudy {each.study.name}: {each.study.file.summary}")
+            console.print(f"\nstudy {each.study.name}: {each.study.summary}")
         now = each.now(where)
         submitted = study_runner.train_missing(now.works, where, budget, began, not progress)
         yield replace(now.now(where), submitted=submitted)
@@ -300,15 +300,15 @@ def train_studies(
 
 def end_study(name: str, *, runs: str | PathLike[str] = "runs") -> None:
     """End a study with looks before all is decided: open pairs stay open, and it cannot go on."""
-    StudyWithLooks(studies.find(name), Path(runs)).end()
+    Study(studies.find(name), Path(runs)).end()
 
 
 def take_looks(
-    study: Study, where: Where, budget: str | None, runs: str | PathLike[str], progress: bool
+    study: StudyFile, where: Where, budget: str | None, runs: str | PathLike[str], progress: bool
 ) -> State:
     """Train a study with looks until all pairs are decided; print the decisions of every look."""
     missing.check_budget(budget, where)
-    return study_runner.take_looks(StudyWithLooks(study, Path(runs)), where, budget, not progress)
+    return study_runner.take_looks(Study(study, Path(runs)), where, budget, not progress)
 
 
 def require_unchanged(name: str, given: Mapping[str, object]) -> None:

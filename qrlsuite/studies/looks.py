@@ -42,7 +42,6 @@ from qrlsuite.studies.study import (
     EntriesSection,
     LooksSection,
     Member,
-    Study,
     StudyFile,
     dumps,
     load_kept,
@@ -60,7 +59,7 @@ LONG = 40
 """Characters of a name beyond which a new study leaves out the common part of its names."""
 
 
-class StudyWithLooks:
+class Study:
     """A study with looks and its results folder.
 
     Attributes
@@ -81,14 +80,14 @@ class StudyWithLooks:
         Where its results are, or will be.
     """
 
-    def __init__(self, study: Study, runs: Path) -> None:
-        if study.file.looks is None:
-            raise OptionError(f"study '{study.name}' has no looks: add a table [looks] to {study.source}")
-        self.source, self.runs = study.source, runs
-        self.folder = runs / FOLDER / study.name
-        self.file, members = _fixed(study)
+    def __init__(self, file: StudyFile, runs: Path) -> None:
+        if file.looks is None:
+            raise OptionError(f"study '{file.name}' has no looks: add a table [looks] to {file.origin}")
+        self.source, self.runs = file.origin, runs
+        self.folder = runs / FOLDER / file.name
+        self.file, members = _fixed(file)
         if self.begun and (self.folder / FILE).is_file():
-            self.file = _with_code_of(self.file, load_kept(self.folder / FILE).file)
+            self.file = _with_code_of(self.file, load_kept(self.folder / FILE))
         self.looks = self.file.looks or LooksSection()
         self.hash = digest(_content(self.file))
         self.epochs = self.looks.epochs or 0
@@ -166,7 +165,7 @@ class StudyWithLooks:
                     f"with looks needs seeds that nobody has seen; with first_seed = {self._next_block()} it has others"
                 )
             return False
-        before, after = _content(load_kept(self.folder / FILE).file), _content(self.file)
+        before, after = _content(load_kept(self.folder / FILE)), _content(self.file)
         if digest(before) != self.hash:
             changes = [
                 f"{key} (was {_short(before.get(key))}, is {_short(after.get(key))})"
@@ -330,7 +329,7 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[State], list[
     outcomes, refused = [], []
     for path in sorted((runs / FOLDER).glob(f"*/{FILE}")):
         try:
-            study = StudyWithLooks(load_kept(path), runs)
+            study = Study(load_kept(path), runs)
             if study.begun and (not tasks or study.task in tasks):
                 outcomes.append(study.read())
         except QrlSuiteError as error:
@@ -351,7 +350,7 @@ def new(
     *,
     first_seed: int | None = None,
     **looks: Any,
-) -> StudyWithLooks:
+) -> Study:
     """Return a new study with looks, dated now; writes nothing.
 
     Parameters
@@ -380,16 +379,16 @@ def new(
         )
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(files.problems(error, StudyFile))) from None
-    study = StudyWithLooks(Study(file, "the study"), runs)
+    study = Study(file.of("the study"), runs)
     while first_seed is None and study.trained_before():
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
-        study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
+        study = Study(study.file.model_copy(update={"looks": moved}).of("the study"), runs)
     names, shared = list(study.entries), list[str]()
     if not any(table.name for table in study.file.entries):  # names that were written stay as they are
         names, shared = _brief(names)
     if shared:
         tables = [table.model_copy(update={"name": name}) for table, name in zip(study.file.entries, names)]
-        study = StudyWithLooks(Study(study.file.model_copy(update={"entries": tables}), "the study"), runs)
+        study = Study(study.file.model_copy(update={"entries": tables}).of("the study"), runs)
     summary = question_of(names) + (f" All have {' '.join(shared)}." if shared else "")
     study.file = study.file.model_copy(update={"summary": summary})
     return study
@@ -417,9 +416,9 @@ def _brief(names: Sequence[str]) -> tuple[list[str], list[str]]:
     return (brief, shared) if len(set(brief)) == len(brief) else (list(names), [])
 
 
-def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:
+def _fixed(file: StudyFile) -> tuple[StudyFile, list[Member]]:
     """Return a study with every entry by itself, its hash, and all that is compared written out; and its entries."""
-    members, source = study.members(), study.source
+    members, source = file.members(), file.origin
     if len(members) < 2:
         labels = [member.table.name or member.entry.label for member in members]
         raise OptionError(f"{source}: entries = {labels}: a study with looks needs two or more entries")
@@ -434,7 +433,7 @@ def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:
                 raise OptionError(
                     f"{source}: entries.{before} and entries.{index} are the same, '{entry.label}': leave one out"
                 )
-    looks = study.file.looks or LooksSection()
+    looks = file.looks or LooksSection()
     entries = [member.entry for member in members]
     if len({entry.task.world for entry in entries}) > 1:
         tasks = sorted({entry.task.name for entry in entries})
@@ -445,7 +444,7 @@ def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:
         fixed |= {"epsilons": ranking.epsilons, "thresholds": ranking.thresholds}
     alone = Counter(member.group for member in members)
     tables = [_fixed_table(member, named=alone[member.group] == 1) for member in members]
-    return study.file.model_copy(update={"looks": looks.model_copy(update=fixed), "entries": tables}), members
+    return file.model_copy(update={"looks": looks.model_copy(update=fixed), "entries": tables}), members
 
 
 def _common_epochs(source: str, entries: Sequence[Entry]) -> int:

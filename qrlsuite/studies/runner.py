@@ -26,9 +26,9 @@ from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed
 from qrlsuite.results.text import counted, duration_range, hours_range, hours_text
 from qrlsuite.statistics.sequential import Decision
-from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.looks import Study
 from qrlsuite.studies.state import State, versus
-from qrlsuite.studies.study import Member, Study
+from qrlsuite.studies.study import Member, StudyFile
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,7 +49,7 @@ class Overview(Shown):
         One line for each entry that was handed to a queue.
     """
 
-    study: Study
+    study: StudyFile
     members: Sequence[Member]
     works: Sequence[Missing]
     workers: int
@@ -72,9 +72,7 @@ class Overview(Shown):
         costs = [_cost(*each) for each in self._measured]
         known = [cost for cost in costs if cost is not None]
         return {
-            **self.study.file.model_dump(
-                mode="json", exclude={"format_version", "entries", "pictures", "looks"}
-            ),
+            **self.study.model_dump(mode="json", exclude={"format_version", "entries", "pictures", "looks"}),
             "entries": [
                 self._entry(*each)
                 | ({} if self.published is None else {"published": self.published[each[0].entry.name]})
@@ -113,7 +111,7 @@ class Overview(Shown):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show the study's question, a row per entry, and the remaining work."""
-        file = self.study.file
+        file = self.study
         yield Text(file.summary, style="bold")
         if file.source:
             yield Text(file.source)
@@ -194,7 +192,7 @@ def _left(costs: Sequence[tuple[Missing, Speed | None]], workers: int) -> str:
 
 
 def select(
-    study: Study,
+    study: StudyFile,
     settings: Sequence[Setting] = (),
     models: Mapping[str, str] | None = None,
     only: Sequence[str] = (),
@@ -262,7 +260,7 @@ def train_missing(
     return tuple(submitted)
 
 
-def take_looks(study: StudyWithLooks, where: Where, budget: str | None, quiet: bool) -> State:
+def take_looks(study: Study, where: Where, budget: str | None, quiet: bool) -> State:
     """Train the seeds of each look and take it, until every pair is closed, or others have the seeds.
 
     Unless it is quiet, it prints the decisions of every look.

@@ -35,7 +35,7 @@ from qrlsuite.statistics.sequential import Decided, Decision, PairDecision
 from qrlsuite.statistics.times import MeanTime, mean_time
 
 if TYPE_CHECKING:
-    from qrlsuite.studies.looks import StudyWithLooks
+    from qrlsuite.studies.looks import Study
 
 Pair = TypeVar("Pair")
 """A pair's decision, or more facts on it."""
@@ -69,7 +69,7 @@ class State(Shown):
         One line for each entry whose seeds were handed to a queue.
     """
 
-    study: StudyWithLooks
+    study: Study
     begun: bool
     begun_at: str | None
     ended: str | None
@@ -335,7 +335,7 @@ class State(Shown):
                 yield f"  {command('run', *words, '--seeds', seeds, '--epochs', '3', runs=study.runs)}"
 
 
-def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
+def by_question(study: Study, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
     """Return each question of a study with its pairs, in order; the text is empty if the study asks none."""
     texts = study.questions or [""] * len(pairs)
     return [
@@ -344,7 +344,7 @@ def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str,
     ]
 
 
-def reason_note(study: StudyWithLooks) -> str:
+def reason_note(study: Study) -> str:
     """Return a warning with the reason given where a study looks below 20 seeds; else an empty text."""
     if study.design.looks[0] >= 20:
         return ""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import AwareDatetime, Field, model_validator
+from pydantic import AwareDatetime, Field, PrivateAttr, model_validator
 
 from qrlsuite import files, notation, options, own, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
@@ -165,8 +165,9 @@ class PictureSection(Table):
 
 
 class StudyFile(Table):
-    """A whole study file."""
+    """A study: its entries, what it asks and when to look, and its pictures."""
 
+    _origin: str = PrivateAttr("")
     format_version: Literal[1]
     name: Name
     summary: Annotated[str, Field(min_length=1)]
@@ -206,35 +207,16 @@ class StudyFile(Table):
             raise ValueError("; ".join(problems))
         return self
 
-
-@dataclass(frozen=True)
-class Member:
-    """An entry of a study, its group, and the group's table reduced to this entry."""
-
-    group: str
-    entry: Entry
-    table: EntriesSection
-
-
-@dataclass(frozen=True)
-class Study:
-    """A validated study.
-
-    Attributes
-    ----------
-    file:
-        The study file's content.
-    source:
-        Where it came from, for messages.
-    """
-
-    file: StudyFile
-    source: str
-
     @property
-    def name(self) -> str:
-        """The study's name."""
-        return self.file.name
+    def origin(self) -> str:
+        """Where it came from, for messages."""
+        return self._origin or self.name
+
+    def of(self, origin: str) -> StudyFile:
+        """Return the study with where it came from."""
+        named = self.model_copy()
+        named._origin = origin
+        return named
 
     def members(
         self, settings: Sequence[Setting] = (), models: Mapping[str, str] | None = None
@@ -253,7 +235,7 @@ class Study:
         by_group: dict[str | None, list[Member]] = {}
         every: list[Member] = []
         used: set[tuple[str | None, str]] = set()
-        for index, group in enumerate(self.file.entries):
+        for index, group in enumerate(self.entries):
             members: dict[tuple[str, str], Member] = {}
             targets = [m.entry for m in by_group[group.match.group]] if group.match is not None else [None]
             try:
@@ -264,7 +246,7 @@ class Study:
                     members.setdefault((member.entry.task.name, member.entry.name), member)
             except QrlSuiteError as error:
                 place = f"entries.{index}" if group.name is None else f"group '{group.name}'"
-                raise type(error)(f"{self.source}, {place}: {error}") from None
+                raise type(error)(f"{self.origin}, {place}: {error}") from None
             by_group[group.name] = list(members.values())
             every += members.values()
         for name in sorted(set(models) - named):
@@ -277,6 +259,15 @@ class Study:
         if len(every) > LARGEST:
             raise OptionError(f"study '{self.name}' has {len(every)} entries, more than {LARGEST}")
         return every
+
+
+@dataclass(frozen=True)
+class Member:
+    """An entry of a study, its group, and the group's table reduced to this entry."""
+
+    group: str
+    entry: Entry
+    table: EntriesSection
 
 
 @dataclass(frozen=True)
@@ -359,8 +350,8 @@ def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:
     return any(setting.name in options.field_names(cls) for cls in chosen)
 
 
-def parse(text: str, source: str, folder: Path | None = None) -> Study:
-    """Parse and validate a study; the entries are resolved by `Study.members`.
+def parse(text: str, source: str, folder: Path | None = None) -> StudyFile:
+    """Parse and validate a study; the entries are resolved by `StudyFile.members`.
 
     Parameters
     ----------
@@ -370,7 +361,7 @@ def parse(text: str, source: str, folder: Path | None = None) -> Study:
     content = files.parse(text, source)
     own.load_named(content.pop("plugins", []), folder, source)
     data = _with_table(content)
-    return Study(files.validate(data, StudyFile, source), source)
+    return files.validate(data, StudyFile, source).of(source)
 
 
 def _with_table(data: dict[str, Any]) -> dict[str, Any]:
@@ -405,12 +396,12 @@ def dumps(file: StudyFile) -> str:
     return tomli_w.dumps(content)
 
 
-def load(name: str) -> Study:
+def load(name: str) -> StudyFile:
     """Load a registered study by name, or a study file by path (anything that ends in `.toml`), with its plugins."""
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
     return parse(files.read(path, "study file"), path.name, path.parent)
 
 
-def load_kept(path: Path) -> Study:
+def load_kept(path: Path) -> StudyFile:
     """Load the file of a study that lies with its results; these may be a stranger's, so it loads no plugin."""
     return parse(files.read(path, "study file"), path.name)

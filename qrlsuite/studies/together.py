@@ -176,8 +176,11 @@ def together(studies: Sequence[State]) -> StudiesTogether:
         else:
             ratios.append((asked, first, second, ratio))
     adjusted = holm(np.array([ratio.p for *_, ratio in ratios])).tolist()
-    found = [SharedPair(*names, replace(ratio, p=p)) for (*names, ratio), p in zip(ratios, adjusted)]
-    return StudiesTogether(tuple(studies), tuple(found), tuple(left_out))
+    found = tuple(
+        SharedPair(asked, first, second, replace(ratio, p=p))
+        for (asked, first, second, ratio), p in zip(ratios, adjusted)
+    )
+    return StudiesTogether(tuple(studies), found, tuple(left_out))
 
 
 def _shared(studies: Sequence[State]) -> Iterator[tuple[str, str, str]]:

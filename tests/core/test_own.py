@@ -631,7 +631,7 @@ def test_a_new_study_names_the_plugins_of_its_entries() -> None:
     api.new_study("studies/ring.toml", entries, task="beam6g", runs="none")
     own.unload(ring)
     assert Path("studies/ring.toml").read_text().startswith('plugins = ["../ring.py"]\n')
-    assert study.load("studies/ring.toml").file.looks is not None
+    assert study.load("studies/ring.toml").looks is not None
     assert names() == {"ansatz": ["ring"]}
 
 

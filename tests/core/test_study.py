@@ -150,7 +150,7 @@ def test_core_hours_follow_from_the_papers_run_times() -> None:
             15 if e.model.name == "mlp" else table[e.model_options.qubits, e.model_options.layers]
             for e in unique.values()
         ]
-        assert loaded.file.core_hours == round(sum(seconds) * 100 * 100 / 3600)
+        assert loaded.core_hours == round(sum(seconds) * 100 * 100 / 3600)
 
 
 def test_matched_sizes_are_the_nearest_of_all() -> None:

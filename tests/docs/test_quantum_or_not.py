@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.store import read_lines
-from qrlsuite.studies.looks import FILE, LOG, StudyWithLooks
+from qrlsuite.studies.looks import FILE, LOG, Study
 from qrlsuite.studies.state import State
 from qrlsuite.studies.study import load as load_study
 from tests.conftest import cases
@@ -72,9 +72,9 @@ def test_hash_permutations_and_next_look_are_those_of_the_log(name: str, tmp_pat
     every = outcome.study.design.looks
     expected = set() if outcome.finished else {every[len(looks)]}
     assert set(outcome.decision.wanted.values()) == expected
-    own = StudyWithLooks(published_studies.load(published_studies.PUBLISHED / name), tmp_path)
+    own = Study(published_studies.load(published_studies.PUBLISHED / name), tmp_path)
     own.begin()
-    assert StudyWithLooks(load_study(str(own.folder / FILE)), tmp_path).hash == outcome.study.hash
+    assert Study(load_study(str(own.folder / FILE)), tmp_path).hash == outcome.study.hash
     assert set(own.look().decision.wanted.values()) == {every[0]}
 
 

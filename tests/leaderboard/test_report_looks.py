@@ -17,7 +17,7 @@ from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
-from qrlsuite.studies.looks import StudyWithLooks, in_folder, new
+from qrlsuite.studies.looks import Study, in_folder, new
 from tests.commands import say
 from tests.conftest import TINY
 from tests.leaderboard import boards
@@ -26,7 +26,7 @@ STARTS = {"mlp width=16": 5, "mlp width=8": 5, "mlp width=4": 14}
 """The epoch from which the runs of an entry are good, one epoch earlier or later by turns."""
 
 
-def put(study: StudyWithLooks, looks: int) -> None:
+def put(study: Study, looks: int) -> None:
     """Leave the seeds of some looks in the study's folder as workers would, and take the looks."""
     study.begin()
     state = study.look()

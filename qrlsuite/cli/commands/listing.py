@@ -63,7 +63,7 @@ def _published_studies() -> list[dict[str, str]]:
 
     return [
         {"kind": "studies", "name": path.parent.name, "distribution": "qrlsuite"}
-        | {"summary": load(str(path)).file.summary}
+        | {"summary": load(str(path)).summary}
         for path in sorted(PLANS.glob("*/plan.toml"))
     ]
 

@@ -145,7 +145,7 @@ def run(
     qrlsuite study run all --budget 8h
     """
     where = where_of(engine, workers, device, same)
-    if name != ALL and (study := studies.find(name)).file.looks is not None:
+    if name != ALL and (study := studies.find(name)).looks is not None:
         given = {"--seeds": seeds, "--epochs": epochs, "--dry-run": dry_run}
         require_unchanged(name, {**dict.fromkeys(words or (), True), **given})
         outcome = take_looks(study, where, budget, runs, not json_output)
