@@ -48,15 +48,6 @@ def test_tensors_keep_their_gradient(circuit, parameters):
     assert weights.grad.abs().sum() > 0
 
 
-def test_a_seed_makes_samples_repeatable(circuit, parameters):
-    def run(seed):
-        options = {"backend": "pennylane", "shots": 50, "seed": seed}
-        return expectations(circuit, np.ones((4, 2)), parameters, **options)
-
-    assert torch.equal(run(1), run(1))
-    assert not torch.equal(run(1), run(2))
-
-
 ONES = np.ones((3, 2))
 
 

@@ -264,16 +264,6 @@ def test_qubits_that_no_gate_connects_have_states_of_their_own(path: str) -> Non
     torch.testing.assert_close(w.grad, expected, rtol=0, atol=1e-12)
 
 
-def test_components_of_a_circuit() -> None:
-    circuit = Circuit(6)
-    circuit.append("CNOT", (4, 1))
-    circuit.append("RX", 0, circuit.input(0))
-    circuit.append("RX", 3, circuit.input(3), control=5)
-    circuit.append("CZ", (1, 2))
-    assert circuit.components() == [[0], [1, 2, 4], [3, 5]]
-    assert compile_circuit(circuit).amplitudes == 2 + 8 + 4
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

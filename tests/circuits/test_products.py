@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from scipy.linalg import expm
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend, expectations
@@ -54,29 +53,6 @@ def words():
     circuit = rich()
     circuit.measure(["X1", (0, 1), "Y0 X2", 3, "X0 Y3 Z2", "Y2", "X1 X3"])
     return circuit
-
-
-@pytest.mark.parametrize("gate", ["RXX", "RYY", "RZZ"])
-def test_a_rotation_of_two_qubits_is_the_exponential_of_its_paulis(gate):
-    circuit = Circuit(2, inputs=1)
-    for q in range(2):
-        circuit.append("RY", q, 0.4 + q)
-        circuit.append("RX", q, 0.9 - q)
-    circuit.append(gate, (0, 1), circuit.input(0))
-    circuit.append("RX", 0, 0.7)
-    circuit.append("RY", 1, 0.8)
-    circuit.measure([0, 1, (0, 1)])
-
-    def turn(pauli, angle):
-        return expm(-0.5j * angle * PAULI[pauli])
-
-    state = np.kron(*(turn("X", 0.9 - q) @ turn("Y", 0.4 + q) @ [1, 0] for q in range(2)))
-    state = expm(-0.5j * 1.3 * np.kron(PAULI[gate[1]], PAULI[gate[1]])) @ state
-    state = np.kron(turn("X", 0.7), turn("Y", 0.8)) @ state
-    z, one = PAULI["Z"], np.eye(2)
-    expected = [np.vdot(state, op @ state).real for op in (np.kron(z, one), np.kron(one, z), np.kron(z, z))]
-    np.testing.assert_allclose(expectations(circuit, [[1.3]], {})[0].numpy(), expected, atol=1e-12)
-    assert shift_evaluations(circuit) == 2
 
 
 @pytest.mark.parametrize("make", [rich, multiples, words])

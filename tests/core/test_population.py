@@ -247,29 +247,6 @@ def test_a_masked_agent_stays_as_if_the_step_had_not_been() -> None:
     assert optimizers[0].steps.tolist() == [6, 3, 0]
 
 
-def test_adam_does_not_depend_on_place_in_the_stack() -> None:
-    source = torch.Generator().manual_seed(0)
-    for shape in ((3,), (10, 3), (17, 5), (64, 64)):
-        values = torch.randn(STACK, *shape, generator=source)
-        gradients = [torch.randn(STACK, *shape, generator=source) for _ in range(3)]
-
-        def run(
-            size: int, offset: int, values: Tensor = values, gradients: list[Tensor] = gradients
-        ) -> Tensor:
-            part = slice(offset, offset + size)
-            module = nn.Module()
-            module.w = nn.Parameter(values[part].clone())
-            optimizer = Adam(module, 1e-3, 1e-3)
-            for gradient in gradients:
-                module.w.grad = gradient[part].clone()
-                optimizer.step()
-            return module.w.detach()
-
-        whole = run(STACK, 0)
-        for size, offset in SLICES:
-            assert torch.equal(run(size, offset), whole[offset : offset + size])
-
-
 def test_quantum_parameters_get_their_own_rate_and_count() -> None:
     class Hybrid(nn.Module):
         def __init__(self) -> None:

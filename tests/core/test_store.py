@@ -255,31 +255,6 @@ def test_the_recorded_version_is_that_of_the_code_that_runs(monkeypatch: pytest.
     }
 
 
-def test_the_record_of_a_seed_says_what_was_trained(kept: Train) -> None:
-    """Trackers are given it, and it lies beside the curve for whoever finds the folder."""
-    folder = kept("runs", [3], 1)
-    entry = store.EntryStore(folder).entry()
-    record = json.loads((folder / "seed-0003" / "run.json").read_text())
-    expected = {
-        "task": "tiny",
-        "task_hash": entry.task.hash,
-        "entry": folder.name,
-        "label": "ddqn mlp width=16",
-        "algorithm": "ddqn",
-        "model": "mlp",
-        "family": "classical",
-        "seed": 3,
-        "interactions_per_epoch": 60,
-        "status": "finished",
-        "epochs": 1,
-    }
-    assert {name: record.get(name) for name in expected} == expected
-    assert record["model_options"]["width"] == 16
-    assert record["algorithm_options"]["lr"] == 0.0005
-    weights = 3 * 16 + 16 + 16 * 16 + 16 + 16 * 3 + 3
-    assert record["parameters"] == {"classical": weights, "quantum": 0, "networks": 1}
-
-
 def test_an_entry_shows_once_what_made_all_its_seeds(kept: Train) -> None:
     entry = kept("runs", [0, 1, 2], epochs=1)
     shown = answer("show", entry.name, "--runs", str(entry.parents[1]))

@@ -16,12 +16,10 @@ from qrlsuite import options, registry, specs
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
 from qrlsuite.experiment import catalog, task
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.gymlanes import GymLanes, quick_name
-from qrlsuite.hookspecs import hookimpl
+from qrlsuite.gymlanes import quick_name
 from qrlsuite.plugins.environments.beam6g.placements import placement
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
-from qrlsuite.training.trainer import build_envs
 from tests.commands import qrlsuite
 from tests.conftest import results
 from tests.environments.strangers import HERE
@@ -270,36 +268,3 @@ def test_other_groups_go_on_when_one_fails(stranger: Callable[..., Entry], tmp_p
     again = cli(*words, "--runs", "runs", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert [len(store.seed(seed).epochs()) for seed in (0, 1)] == [4, 4]
-
-
-def test_a_spec_without_a_vector_form_gets_the_generic_one(
-    stranger: Callable[..., Entry], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its options are the keyword arguments of its environment, which is registered by its spec alone."""
-    spec = specs.EnvironmentSpec(
-        name="walk",
-        summary="A walk",
-        options=f"{HERE}:WalkOptions",
-        gymnasium_id="strangers/WalkBySpec-v0",
-        entry_point=f"{HERE}:Walk",
-    )
-
-    class Plugin:
-        @hookimpl
-        def register_environments(self, register: Any) -> None:
-            register(spec)
-
-    fresh = registry.create(strict=True)
-    fresh.add_plugin(Plugin(), "strangers")
-    monkeypatch.setattr(registry, "load", lambda: fresh)
-    text = TASK.format(env_id="", arguments="", source="info").replace('name = "gym"', 'name = "walk"')
-    text = re.sub(r"id = .*\narguments = .*", "start = 3", text)
-    entry = Entry(task.parse(text, "t"), *[None] * 5)  # type: ignore[arg-type]
-    envs = build_envs(entry, 4, lambda: None)
-    assert isinstance(envs.inner, GymLanes)
-    assert envs.inner.envs[3].unwrapped.action_space.start == 3  # type: ignore[attr-defined]
-    envs.seed_lanes([np.random.default_rng(g) for g in range(4)])
-    envs.reset()
-    for _ in range(15):
-        envs.step(np.zeros(4, dtype=np.int64))
-    assert len(envs.take_finished()[0]) >= 4

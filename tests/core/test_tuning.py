@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Sequence
@@ -18,10 +17,8 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.options import parse_setting
-from qrlsuite.results.records import EntryRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning import objective, samplers, search, space
-from tests.conftest import TINY
 
 SETTINGS = (parse_setting("width=4"), parse_setting("depth=1"))
 FIXED = tuple(
@@ -164,36 +161,6 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     }  # fmt: skip
     assert preset.TuningRecord.model_validate({**record, "seeds": "0:20"}).on_protocol_seeds
     assert not preset.TuningRecord.model_validate({**record, "seeds": "1000000:1000020"}).on_protocol_seeds
-
-
-def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
-    path = tmp_path / "t.toml"
-    path.write_text(
-        TINY
-        + "[presets.mine.ddqn.all]\nlr = 0.1\ngamma = 0.5\n"
-        + '[tuning.mine.ddqn.quantum]\ntrials = 3\nseeds = "0:20"\n'
-    )
-    circuit = "vqc-native qubits=2 layers=1 gamma=.9"
-    entry = resolve(str(path), circuit, preset="mine")
-    assert entry.tuning is not None
-    assert entry.tuning["trials"] == 3
-    assert entry.tuning["preset"] == "mine"
-    assert entry.tuning["changed"] == ["algorithm.gamma"], "qubits are none of the preset's"
-    assert entry.tuning["on_protocol_seeds"]
-    assert (entry.tuning["steps"], entry.tuning["value"]) == (None, None), "not known, and not made up"
-    assert entry.task.hash == resolve(str(path), "mlp").task.hash
-    assert resolve(str(path), "mlp", preset="mine").tuning is None, "nothing is said of networks"
-    assert resolve(str(path), circuit).tuning is None, "it is not the default"
-    assert "tuning" not in EntryRecord.of(entry).content["task_file"], "older versions read the record"
-
-    store = EntryStore.create(tmp_path / "runs", dataclasses.replace(entry, tuning=None))
-    assert store.record().tuned is None
-    EntryStore.create(tmp_path / "runs", entry)
-    assert store.record().tuned == entry.tuning
-    counted = dataclasses.replace(entry, tuning={**entry.tuning, "steps": 100})
-    EntryStore.create(tmp_path / "runs", counted)
-    EntryStore.create(tmp_path / "runs", entry)
-    assert store.record().tuning.steps == 100, "a record that knows its steps stays"
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from pydantic.dataclasses import dataclass
 
 from qrlsuite import actions as action_spaces
 
@@ -89,13 +88,6 @@ class Walk(gymnasium.Env[Any, Any]):
             "tuple": (self.steps % 2, np.ones(1, np.float32)),
             "sequence": (),
         }[self.kind]
-
-
-@dataclass(frozen=True)
-class WalkOptions:
-    """Options of `Walk`."""
-
-    start: int = 0
 
 
 class Forgetful(Walk):

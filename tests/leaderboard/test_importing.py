@@ -168,21 +168,6 @@ def test_a_seed_that_differs_stays_as_it_is_here(copied: EntryStore, elsewhere: 
     )
 
 
-def test_a_seed_that_goes_on_there_is_taken_over(copied: EntryStore, elsewhere: Path, tmp_path: Path) -> None:
-    """It has three epochs there and two here; both folders can then train the fourth, to the same bytes."""
-    take(elsewhere, tmp_path / "runs")
-    train_group(copied.path, [1], 3)
-    done = import_seeds.import_seeds(copied, tmp_path / "runs")
-    assert (done.new, done.known, done.notes) == ((1,), (0,), ())
-    assert files(done.store.seed(1).path) == files(copied.seed(1).path)
-    assert not list(done.store.path.glob(".seed*"))
-    for store in (copied, done.store):
-        train_group(store.path, [1], 4)
-    assert done.store.seed(1).table.read_bytes() == copied.seed(1).table.read_bytes()
-    again = take(elsewhere, tmp_path / "runs")
-    assert (again.new, again.known, again.notes) == ((), (0, 1), ()), "the longer curve stays"
-
-
 def test_a_longer_seed_without_an_agent_takes_none_away(
     copied: EntryStore, elsewhere: Path, tmp_path: Path
 ) -> None:

@@ -35,20 +35,6 @@ def test_the_papers_parameter_counts(qubits, total):
     assert quantum == 6 * 4 * qubits
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_one_agent_is_linear_circuit_linear(backend):
-    given = small(backend, qubits=2, layers=1, dtype="float64")
-    module = agents(1, given, obs=4, out=5)[0]
-    x = observations(6, 4, dtype=torch.float64)
-    p = dict(module.named_parameters())
-    inner = x @ p["input.weight"].T + p["input.bias"]
-    quantum = {name: p[f"circuit.{name}"][None] for name in ("scaling", "weights")}
-    values = create_backend("pennylane", ansatz("iqp", 2, 1))(inner[None], quantum)[0]
-    expected = values @ p["output.weight"].T + p["output.bias"]
-    assert module(x).shape == (6, 5)
-    torch.testing.assert_close(module(x), expected, atol=1e-9, rtol=0)
-
-
 def test_activations_sit_on_both_sides_of_the_circuit():
     with_both = {"activation_in": "tanh", "activation_out": "relu"}
     plain, both = (agents(1, small(dtype="float64", **v))[0] for v in ({}, with_both))
