@@ -271,12 +271,12 @@ def _file(shown: str, place: Path) -> dict[str, bytes]:
         except (SyntaxError, ValueError):  # is said where it is imported
             continue
         found: dict[str, bytes] = {}
-        for module in set(_imports(tree)):
+        for module in set(_imports(tree)) - sys.stdlib_module_names - _installed():
             file, folder = place.with_name(f"{module}.py"), place.with_name(module)
-            if file.is_file() and _is_beside(module, place.parent):
+            if file.is_file():
                 found[file.name] = _bytes(shown, file)
-            elif (folder / "__init__.py").is_file() and _is_beside(module, place.parent):
-                found |= _folder(shown, folder)
+            elif (folder / "__init__.py").is_file():
+                found |= _folder(f"{shown}, which imports {module},", folder)
         for data in _declared(tree):
             file = (place.parent / name).parent / data
             if not file.resolve().is_relative_to(place.parent.resolve()):
@@ -304,19 +304,6 @@ def _declared(tree: ast.Module) -> Iterator[str]:
         value = getattr(node, "value", None)
         if any(getattr(each, "id", None) == "files" for each in targets) and isinstance(value, ast.List):
             yield from (str(each.value) for each in value.elts if isinstance(each, ast.Constant))
-
-
-def _is_beside(module: str, folder: Path) -> bool:
-    """Return whether an import of a module means the one in a folder: Python has no other of its name."""
-    if module in sys.stdlib_module_names or module in _installed():
-        return False
-    spec = _found(module)
-    if spec is None or spec.origin is None or _is_copy(spec.origin):
-        return True
-    place = Path(spec.origin).resolve()
-    if place.parent in (Path.cwd(), Path.cwd() / "__pycache__"):  # from where workers do not import
-        return True
-    return place in (folder.resolve() / f"{module}.py", folder.resolve() / module / "__init__.py")
 
 
 def _installed() -> set[str]:
@@ -514,11 +501,18 @@ def _require_free(source: Source) -> None:
             raise PluginError(
                 f"{source.path}: {name} is installed, as {each.distribution}: leave --plugin out, or rename this one"
             )
-    if not _is_beside(name, source.path.parent):
-        origin = getattr(_found(name), "origin", None) or "built-in"
-        raise PluginError(
-            f"{source.path}: Python has another module '{name}' ({origin}): rename this one, for example my_{name}"
-        )
+    origin = getattr(_found(name), "origin", None)
+    if name in sys.stdlib_module_names:
+        origin = "built-in"
+    elif (
+        origin is None or _is_copy(origin) or Path(origin).parent in (Path.cwd(), Path.cwd() / "__pycache__")
+    ):
+        return  # workers do not import from the folder where Python was started
+    elif os.path.realpath(origin) in {os.path.realpath(source.place(file)) for file in source.files}:
+        return
+    raise PluginError(
+        f"{source.path}: Python has another module '{name}' ({origin}): rename this one, for example my_{name}"
+    )
 
 
 def _found(module: str) -> ModuleSpec | None:

@@ -5,7 +5,7 @@
     a circuit                 its description, as built: gates, wires, angles, parameters (`canonical`)
     a plugin's other parts    the syntax trees of the modules that its code reaches by imports within its distribution;
                               of an environment, the distribution's data as well
-    their package             all other files that it installs, or that belong to the plugin by path
+    their plugin              all other files that it installs, or that belong to the plugin by path
     a file that an option     its bytes
     names
 
@@ -174,7 +174,7 @@ def _packages(entry: Entry, parts: Sequence[Part]) -> Iterator[Part]:
     for distribution, modules in roots.items():
         of_package = _installed(modules, distribution)
         if files := {file: code for file, code in of_package.items() if file not in covered}:
-            yield {"role": "package", "name": distribution, "distribution": distribution, "files": files}
+            yield {"role": "plugin", "name": distribution, "distribution": distribution, "files": files}
 
 
 def _environment_id(entry: Entry, role: str) -> str | None:

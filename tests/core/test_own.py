@@ -446,6 +446,13 @@ def test_a_file_brings_the_modules_beside_it_that_it_imports_and_the_data_that_i
     assert identity.plugins(entry) == [made.source]
 
 
+def test_the_module_beside_a_file_is_meant_where_python_has_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    write("elsewhere/helper.py", "raise SystemExit\n")
+    monkeypatch.syspath_prepend(Path("elsewhere").absolute())
+    own.load(helped())
+    assert first_network(resolve("beam6g", "scaled")).scale == 2
+
+
 @pytest.mark.parametrize(
     ("path", "text", "counts"),
     [
