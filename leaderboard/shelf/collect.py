@@ -57,15 +57,10 @@ class Selection:
 
     @classmethod
     def create(
-        cls,
-        runs: str | PathLike[str],
-        task: str | Sequence[str] | None = None,
-        published: bool = False,
-        all_codes: bool = False,
+        cls, runs: str | PathLike[str], task: str | Sequence[str] | None = None, published: bool = False
     ) -> Selection:
         """Make a selection from the arguments of a command or of `qrlsuite.api`; tasks stay in the user's words."""
-        tasks = (task,) if isinstance(task, str) else tuple(task or ())
-        return cls(Path(runs), published, tasks, all_codes=all_codes)
+        return cls(Path(runs), published, (task,) if isinstance(task, str) else tuple(task or ()))
 
     def of(self, *tasks: str) -> Selection:
         """Return the selection of other tasks."""
@@ -149,12 +144,12 @@ def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
             kinds.append([entry])
         else:
             same.append(entry)
-    return sorted(kinds, key=_newness, reverse=True)
+    return sorted(kinds, key=_newness, reverse=True) if len(kinds) > 1 else kinds
 
 
 def _newness(kind: Sequence[EntryResults]) -> tuple[bool, str, int]:
     seeds = {seed for entry in kind for seed in entry.seeds}
-    return len(seeds) >= MIN_RUNS, max(entry.trained for entry in kind), len(seeds)
+    return len(seeds) >= MIN_RUNS, max(EntryStore(entry.folder).trained for entry in kind), len(seeds)
 
 
 def select(

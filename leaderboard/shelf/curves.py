@@ -314,11 +314,6 @@ class EntryResults(Shown):
         """Marks of the contents of plugins by path that trained its seeds, by file name."""
         return codes.contents(self.record, self.codes)
 
-    @property
-    def trained(self) -> str:
-        """When the newest of its epochs ended, in UTC; empty if not recorded."""
-        return max((run.time for run in self.records.values()), default="")
-
     def labeled(self, label: str) -> EntryResults:
         """Return the entry with a label of your own, for pictures and tables."""
         return replace(self, record=self.record.model_copy(update={"label": label}))

@@ -143,7 +143,7 @@ def board(
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
-    written = Selection.create(runs, task, published, all_codes)
+    written = replace(Selection.create(runs, task, published), all_codes=all_codes)
     selection = written.named()
     together = selection.tasks if len(selection.tasks) > 1 else ()
     if rule is not None and (together or by != "steps"):
@@ -205,12 +205,7 @@ def write_page(
     from qrlsuite.leaderboard.shelf import published_studies
 
     tasks, runs = written.tasks, written.runs
-    asked |= {
-        "runs": runs,
-        "published": written.published,
-        "all_codes": written.all_codes,
-        "study": study,
-    }
+    asked |= {"runs": runs, "published": written.published, "study": study}
     beside = None if len(tasks) < 2 and by == "steps" else board(tasks, by=by, **asked)
     shown = [board(names, **asked) for names in [[task] for task in tasks] or [[]]]
     sections = tuple(section for one in shown for section in one.sections)
@@ -293,14 +288,13 @@ def compare(
     others, left_out = collect.collect(selection.of(left.task))
     among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
     places = (f"of the same entry, from {left.folder}", f"of the same entry, from {other.folder}")
-    copies = [f"left out: {line}" for line in left_out if line.endswith(places)]
-    newer = [
-        f"'{shown.label}' is the same entry as '{mine.label}', of newer code"
-        for mine in (left, other)
-        for shown in others
-        if shown.record.hash == mine.record.hash and not shown.has_code_of(mine)
+    codes = [f"than '{one.record.label}{end}" for one in (left, other) for end in ("'", " @")]
+    copies = [
+        f"left out: {line}"
+        for line in left_out
+        if line.endswith(places) or any(code in line for code in codes)
     ]
-    return replace(compared, among=among, remarks=(*compared.remarks, *copies, *newer))
+    return replace(compared, among=among, remarks=(*compared.remarks, *copies))
 
 
 def plot(

@@ -77,25 +77,21 @@ def places(
         code = identity.of(entry)
         store = codes.place(runs, entry, code)
         before = codes.other(runs, entry, code)
-        held = None if before is None else codes.of(before)
-        if before is not None and held is not None:
-            seeds = (
-                f"{before.path} has seeds {format_seeds(before.seeds())} of another code: {held.change(code)}"
-            )
-            if reason is not None:
-                _require_loadable(entry, before)
-                codes.link(before, code, reason)
-                store = before
-            elif entry.plan is not None:
+        if before is not None and reason is not None:
+            _require_loadable(entry, before)
+            codes.link(before, code, reason)
+            store = codes.place(runs, entry, code)
+        elif before is not None and codes.of(store) is None:
+            seeds = f"{before.path} has seeds {format_seeds(before.seeds())} of another code"
+            if entry.plan is not None:
                 raise codes.ChangedCodeError(
-                    f'{seeds}. Nothing was trained. Restore that code, or write another study; and --same "REASON" '
-                    "says that nothing changed in effect"
+                    f"{seeds}: {codes.change(before, code)}. Nothing was trained. Restore that code, or write another "
+                    'study; and --same "REASON" says that nothing changed in effect'
                 )
-            elif codes.of(store) is None:
-                anew.append(
-                    f"{seeds}. Begun anew is '{entry.label} {store.mark}'; --same \"REASON\" continues the old seeds, "
-                    "if nothing changed in effect"
-                )
+            anew.append(
+                f"{seeds}: {codes.change(before, code)}. Begun anew is '{entry.label} {store.mark}'; --same \"REASON\" "
+                "continues the old seeds, if nothing changed in effect"
+            )
         found.append((store, code))
     if anew:
         more = f" (and so for {counted(len(anew) - 1, 'more entry')})" if len(anew) > 1 else ""

@@ -55,17 +55,6 @@ class CodeOfFolder:
         original = all(each.original for each in (code, self.first) if each is not None)
         return original or (UNKNOWN if code is None else code.digest) in self.digests
 
-    def change(self, current: CodeIdentity) -> str:
-        """Say how another code differs from it."""
-        before = self.first
-        if before is None and all("numerics" in part or part["role"] == "file" for part in current.parts):
-            before = CodeIdentity(
-                tuple({**part, **({"numerics": 1} if "numerics" in part else {})} for part in current.parts)
-            )
-        if before is None:
-            return "begun before the code of plugins was recorded, so nobody knows whether it is the same"
-        return listed(identity.differences(before.parts, current.parts))
-
 
 def of(store: EntryStore) -> CodeOfFolder | None:
     """Return the code of an entry's folder; None without a seed.
@@ -82,6 +71,19 @@ def of(store: EntryStore) -> CodeOfFolder | None:
             digest = UNKNOWN if record.code is None else record.code.digest
             return CodeOfFolder(record.code_identity, linked(store.record(), [digest]))
     return None
+
+
+def change(store: EntryStore, current: CodeIdentity) -> str:
+    """Say how a code differs from the code of an entry's folder."""
+    held = of(store)
+    before = None if held is None else held.first
+    if before is None and all("numerics" in part or part["role"] == "file" for part in current.parts):
+        before = CodeIdentity(
+            tuple({**part, **({"numerics": 1} if "numerics" in part else {})} for part in current.parts)
+        )
+    if before is None:
+        return "begun before the code of plugins was recorded, so nobody knows whether it is the same"
+    return listed(identity.differences(before.parts, current.parts))
 
 
 def linked(record: EntryRecord, digests: Iterable[str]) -> tuple[str, ...]:
@@ -138,15 +140,15 @@ def environments(codes: Iterable[CodeIdentity | None]) -> frozenset[str]:
 
 def require(store: EntryStore, current: CodeIdentity, host: str) -> None:
     """Refuse to train a folder with other code than that of its seeds, or of the machine that started the training."""
-    sent, held = store.record().code_identity, of(store)
+    sent = store.record().code_identity
     if sent is not None and sent != current:
         differing = listed(identity.differences(sent.parts, current.parts))
         raise ChangedCodeError(
             f"{host} would train {store.path} with another code than the machine that started it: {differing}; "
             "install the same on both, and repeat the command"
         )
-    if held is not None and current not in held:
-        raise ChangedCodeError(f"{store.path} has seeds of another code: {held.change(current)}")
+    if not _may_train(store, current):
+        raise ChangedCodeError(f"{store.path} has seeds of another code: {change(store, current)}")
 
 
 def require_installed(store: EntryStore, current: CodeIdentity) -> None:

@@ -246,8 +246,6 @@ class SeedRun:
     measured:
         Metrics of the environment by name: means over each epoch's validation episodes, (T,); NaN where it measured
         none.
-    time:
-        When its last epoch ended, in UTC; empty if not recorded.
     folder:
         The entry's folder.
     published:
@@ -264,7 +262,6 @@ class SeedRun:
     measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     folder: Path = Path()
     published: bool = False
-    time: str = ""
 
     def __add__(self, other: SeedRun) -> SeedRun:
         """Return the longer run; of two equally long runs the published one."""
@@ -421,7 +418,14 @@ class SeedStore:
         Processor time if it was recorded (training on the CPU), since other work on the cores does not stretch it;
         otherwise time by the clock.
         """
-        return _spent(self.times())[0]
+        return self._timed()[0]
+
+    def _timed(self) -> tuple[float, bool]:
+        """Return the core-seconds, and whether some of them are by the clock."""
+        lines, total = self.times(), 0.0
+        for seconds in (seconds for line in lines for seconds in line.spent):
+            total += seconds
+        return total, any(line.cpu is None for line in lines)
 
     def read(self) -> SeedRun:
         """Return the content of the run so far."""
@@ -433,8 +437,7 @@ class SeedStore:
                 "the seed's folder"
             )
         scores = _scores(columns, self.path) if epochs else np.empty((0, 0), np.float32)
-        times = self.times()
-        seconds, clocked = _spent(times)
+        seconds, clocked = self._timed()
         counts, measured = 0, dict[str, NDArray[np.float64]]()
         for name in columns.column_names:
             outer, _, inner = name.partition(".")
@@ -444,18 +447,7 @@ class SeedStore:
                 measured[inner] = _metric(inner, columns[name], self.path)
         diverged = columns["diverged"].to_pylist() if "diverged" in columns.column_names else []
         first = diverged.index(True) + 1 if True in diverged else None
-        return SeedRun(
-            self.seed,
-            record,
-            scores,
-            seconds,
-            counts,
-            clocked,
-            first,
-            measured,
-            self.path.parent,
-            time=times[-1].time if times else "",
-        )
+        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured, self.path.parent)
 
     def _columns(self) -> pyarrow.Table:
         """Return all epochs as columns: of the table, with newer lines behind them."""
@@ -473,14 +465,6 @@ class SeedStore:
             if number != expected:
                 raise StoreError(f"{self.path}: epoch {expected} is missing (found {number!r})")
         return columns
-
-
-def _spent(lines: Sequence[TimingLine]) -> tuple[float, bool]:
-    """Return the core-seconds, and whether some of them are by the clock."""
-    total = 0.0
-    for seconds in (seconds for line in lines for seconds in line.spent):
-        total += seconds
-    return total, any(line.cpu is None for line in lines)
 
 
 def _scores(columns: pyarrow.Table, path: Path) -> NDArray[np.float32 | np.float64]:
@@ -637,8 +621,8 @@ class EntryStore:
     @property
     def trained(self) -> str:
         """When the newest epoch of its seeds ended, in UTC; empty if not recorded."""
-        times = [self.seed(seed).times()[-1:] for seed in self.seeds()]
-        return max((line.time for lines in times for line in lines), default="")
+        seeds = self.seeds() if self.path.is_dir() else ()
+        return max((line.time for seed in seeds for line in self.seed(seed).times()[-1:]), default="")
 
     @classmethod
     def find(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:

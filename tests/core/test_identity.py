@@ -408,9 +408,7 @@ def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(
         EntryStore(folder),
     )
     assert anew.path.name == f"{folder.name}@{current(folder).digest[:8]}"
-    held = codes.of(store)
-    assert held is not None
-    assert held.change(current(folder)) == "algorithm 'ddqn' has numerics 2, and had 1"
+    assert codes.change(store, current(folder)) == "algorithm 'ddqn' has numerics 2, and had 1"
     with pytest.raises(
         StoreError, match="has seeds of another code: algorithm 'ddqn' has numerics 2, and had 1"
     ):
@@ -436,13 +434,17 @@ def test_seeds_of_other_code_in_one_folder_do_not_count(kept: Train, tmp_path: P
     assert entry.seeds == (0, 1, 2, 3)
 
 
-def test_a_board_shows_the_newest_code_with_enough_seeds() -> None:
+def test_a_board_shows_the_newest_code_with_enough_seeds(tmp_path: Path) -> None:
     first, second = (
         identity.CodeIdentity(({"role": "model", "name": name, "distribution": "x"},)) for name in "ab"
     )
-    newer = boards.changed(boards.entry("mlp", 19), code=second, time="2026-01-02")
+    for day in "12":
+        seed = EntryStore(tmp_path / day).seed(0)
+        seed.path.mkdir(parents=True)
+        seed.timings.write_text(json.dumps({"time": f"2026-01-0{day}"}) + "\n")
+    newer = replace(boards.changed(boards.entry("mlp", 19), code=second), folder=tmp_path / "2")
     for seeds, expected in ((19, [newer]), (20, None)):
-        older = boards.changed(boards.entry("mlp", seeds), code=first, time="2026-01-01")
+        older = replace(boards.changed(boards.entry("mlp", seeds), code=first), folder=tmp_path / "1")
         assert collect.by_code([older, newer])[0] == (expected or [older])
     link = SameCodeRecord(codes=[first.digest, second.digest])
     assert len(collect.by_code([boards.changed(older, same=[link]), newer])) == 1

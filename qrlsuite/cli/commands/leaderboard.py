@@ -125,15 +125,16 @@ def leaderboard(
         "alpha": alpha,
         "horizon": horizon,
         "entries": entry or (),
+        "all_codes": all_codes,
     }
     if format_ is Format.html:
-        path, refused = write_page(output, Selection.create(runs, tasks, published, all_codes), **asked)
+        path, refused = write_page(output, Selection.create(runs, tasks, published), **asked)
         _left_out(refused)
         if path is None:
             raise _nothing(runs, tasks)
         typer.echo(f"wrote {path}")
         return
-    board = api.board(tasks, runs=runs, published=published, all_codes=all_codes, **asked)
+    board = api.board(tasks, runs=runs, published=published, **asked)
     if format_ is Format.json:
         typer.echo(json.dumps(board.as_dict()))
         return
