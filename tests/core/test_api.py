@@ -70,19 +70,6 @@ def test_progress_is_lines_where_there_is_no_terminal(
     assert "next:" not in shown
 
 
-def test_trackers_are_asked_for_while_training_only(
-    tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from qrlsuite.training import trackers
-
-    monkeypatch.delenv(trackers.TRACK, raising=False)
-    with trackers.asking([]):
-        assert trackers.asked() == []
-    with trackers.asking(["tensorboard=here"]):
-        assert trackers.asked() == ["tensorboard=here"]
-    assert trackers.asked() == []
-
-
 def test_training_that_is_stopped_before_an_epoch_gives_no_entry(tiny_task: str, tmp_path: Path) -> None:
     assert quiet(tiny_task, tmp_path, seeds=1, budget="0.0001s") is None
     assert quiet(tiny_task, tmp_path, seeds=1, epochs=1).curves.shape == (1, 1)

@@ -23,7 +23,7 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.plugins.models import vqc
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
-from tests.conftest import Train, cases
+from tests.conftest import cases
 from tests.leaderboard import boards
 
 WHERE: dict[str, Any] = {"runs": "no-results-yet", "published": True}
@@ -54,16 +54,6 @@ def test_an_entry_is_read_with_its_curves_and_records(small: EntryResults) -> No
     assert list(small.records) == list(small.seeds) == list(range(100))
     assert {record.epochs for record in small.records.values()} == {100}
     assert sum(record.hours for record in small.records.values()) == pytest.approx(small.hours)
-
-
-def test_runs_have_the_records_that_published_entries_have(
-    train: Train, tmp_path: Path, small: EntryResults
-) -> None:
-    folder = train(tmp_path / "runs", [0, 1])
-    found = api.load(str(folder), runs=tmp_path / "runs")
-    assert list(found.records) == [0, 1]
-    assert all(record.finished and record.hours > 0 for record in found.records.values())
-    assert found.curves.shape == (2, found.records[0].epochs)
 
 
 def test_a_table_has_a_row_per_seed_and_epoch(small: EntryResults) -> None:

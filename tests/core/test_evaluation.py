@@ -20,7 +20,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
 from qrlsuite.training.trainer import count_parameters
-from tests.conftest import Train, golden
+from tests.conftest import Train
 
 WALK = """
 format_version = 1
@@ -56,29 +56,6 @@ def test_the_optimal_policy_scores_one_and_the_others_less(tiny_task: str) -> No
     assert optimal.returns.shape == (1, 150)
 
 
-def test_random_actions_earn_what_the_tables_say(tiny_task: str) -> None:
-    """The mean over antennas of every intensity is what uniformly random actions expect."""
-    entry = resolve(tiny_task, "mlp")
-    *_, random = evaluation.references(entry, episodes=300)
-    from qrlsuite.training.trainer import build_envs
-
-    envs = build_envs(entry, 300, lambda: None)
-    envs.seed_lanes([Streams(entry.task.hash, 0).numpy("evaluation", key) for key in range(300)])
-    envs.reset()
-    expected = envs.inner.tabulate().intensity[:, :, 1:].mean(axis=1).sum(axis=1)  # type: ignore[attr-defined]
-    error = random.returns[0] - expected
-    assert abs(error.mean()) < 4 * error.std() / np.sqrt(300)
-
-
-def test_the_golden_episodes_random_actions_lie_in_the_random_policys_range(tiny_task: str) -> None:
-    episodes = [e for e in golden("beam6g") if len(e["antenna_positions"]) == 3 and e["degree"] == 3]
-    *_, random = evaluation.references(resolve("beam6g", "mlp"), episodes=100)
-    assert random.scores is not None
-    assert episodes
-    for episode in episodes:
-        assert random.scores.min() - 0.05 < episode["ratio"] < random.scores.max() + 0.05
-
-
 def test_nearest_is_by_distance_to_where_the_user_will_be(tiny_task: str) -> None:
     from qrlsuite.plugins.environments.beam6g import trajectory
     from qrlsuite.plugins.environments.beam6g.policies import NearestAntenna
@@ -111,24 +88,6 @@ def test_agents_do_not_depend_on_their_company_and_episodes_repeat(kept: Train) 
     assert alone.returns.tobytes() == together.returns[:1].tobytes()
     assert len(set(together.returns.mean(axis=1))) > 1, "three agents that act alike would hide a mixture"
     assert evaluation.trained(store, 3, 100).returns.tobytes() == together.returns[:, :100].tobytes()
-
-
-def test_loaded_agents_are_the_trained_ones(kept: Train) -> None:
-    """On the validation's own episodes, a loaded agent repeats the last validation scores bit by bit."""
-    from qrlsuite.training.trainer import build_envs
-
-    store = EntryStore(kept("runs", [0, 1], 2))
-    entry = store.entry()
-    agents = evaluation.trained_agents(entry, store, [0, 1])
-    envs = build_envs(entry, 2 * 5, lambda: None)
-    envs.seed_lanes([Streams(entry.task.hash, seed).numpy("validation", 2) for seed in (0, 1)])
-    observations, _ = envs.reset()
-    for _ in range(20):
-        observations, *_ = envs.step(agents.act(observations))
-    _, _, scores = envs.take_finished()
-    for s in (0, 1):
-        stored = store.seed(s).read().scores[-1]
-        assert np.array_equal(stored, scores.reshape(2, 5)[s].astype(np.float32))
 
 
 def test_the_best_runs_are_those_with_the_best_last_validation(kept: Train) -> None:

@@ -238,15 +238,6 @@ def test_evaluated_agents_are_the_trained_ones(
     assert player.statistics.used["count"].tolist() == [120, 120], "of the first two of three epochs"
 
 
-def test_with_other_statistics_an_agent_is_another(train: Train) -> None:
-    store = EntryStore(train("runs", [0, 1], AGENTS[1]))
-    player = evaluation.trained_agents(store.entry(), store, [0, 1])
-    assert player.statistics is not None
-    player.statistics.used["mean"] += 1.0
-    player.statistics.refresh()
-    assert not np.array_equal(play(store.entry(), player), last_scores(store))
-
-
 def last_scores(store: EntryStore) -> NDArray[np.float32]:
     return np.stack([store.seed(seed).read().scores[-1] for seed in (0, 1)])
 

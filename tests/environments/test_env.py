@@ -65,26 +65,11 @@ def test_gymnasium_checker_with_render_mode(mode):
     check_env(gymnasium.make(ID, render_mode=mode, **SMALL).unwrapped, skip_render_check=True)
 
 
-def test_best_choices_score_exactly_one():
-    env = BeamManagement6G(steps=30)
-    env.reset(seed=1)
-    for k in range(30):
-        *_, info = env.step(int(env._tables.intensity[0, :, k + 1].argmax()))
-    assert info["score"] == 1.0
-
-
 def test_first_observation_is_of_the_best_antenna_there():
     # Straight below antenna 0, on its peak: R^2 = 2, the spike 1/R^2.
     env = BeamManagement6G(antennas=[((5.0, 5.0), (1, 0)), ((0.0, 1.0), (1, 0))], degree=2)
     observation, _ = env.reset(options={"support_points": [[0.0, 0.0], [6.0, 0.0]]})
     np.testing.assert_allclose(observation, [1.0, 0.5, 0.5])
-
-
-def test_reset_term_counts_in_the_score():
-    env = BeamManagement6G(steps=2)
-    first, _ = env.reset(seed=3)
-    total = sum(env.step(0)[1] for _ in range(2))
-    assert env._received == pytest.approx(float(first[1]) + total, abs=1e-6)
 
 
 def test_stack_holds_the_last_observations_oldest_first():

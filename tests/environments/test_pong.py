@@ -120,8 +120,3 @@ def test_the_picture_shows_ball_and_paddles() -> None:
     assert (image.shape, image.dtype) == ((320, 270, 3), np.uint8)
     assert (image == (40, 40, 40)).all(2).sum() == 16 * 16
     assert (image == (0, 114, 178)).all(2).sum() == 10 * 35
-
-
-def test_stable_baselines3s_checker_is_content() -> None:
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    checker.check_env(Pong())

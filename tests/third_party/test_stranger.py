@@ -211,25 +211,6 @@ def test_its_backend_computes_a_model(installed: Installation) -> None:
     assert "strength=0.1" in summary["label"]
 
 
-def test_its_circuit_is_trained_on_beam_management(installed: Installation) -> None:
-    words = (
-        "run",
-        "--task",
-        "beam6g",
-        "--model",
-        "vqc-native",
-        "--set",
-        "ansatz=rzz-ring",
-        "--set",
-        "qubits=2",
-    )
-    done = installed.qrlsuite(*words, *TINY, "--runs", "circuits", "--json")
-    record = json.loads(
-        (Path(installed.folder, json.loads(done.stdout)["folder"]) / "seed-0000" / "run.json").read_text()
-    )
-    assert record["provenance"][0]["versions"]["qrlsuite"]
-
-
 @pytest.mark.usefixtures("ranked")
 def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Installation) -> None:
     def board() -> dict[str, Any]:
