@@ -12,6 +12,7 @@ recognized in its top-level module is registered: see `qrlsuite.shortforms`.
 from __future__ import annotations
 
 import ast
+import atexit
 import contextlib
 import hashlib
 import importlib
@@ -134,13 +135,16 @@ def modules() -> set[str]:
 @cache
 def _cache() -> Path:
     """Return the folder of copies: below `QRLSUITE_CACHE` or the user's cache folder, else a temporary one."""
-    for base in (os.environ.get("QRLSUITE_CACHE"), os.environ.get("XDG_CACHE_HOME") or "~/.cache"):
-        folder = Path(base or "~/.cache").expanduser() / "qrlsuite" / "plugins"
+    standard = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    for base in filter(None, (os.environ.get("QRLSUITE_CACHE"), standard)):
+        folder = Path(base).expanduser() / "qrlsuite" / "plugins"
         with contextlib.suppress(OSError, RuntimeError):
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-    return Path(tempfile.mkdtemp(prefix="qrlsuite-plugins-"))
+    temporary = tempfile.TemporaryDirectory(prefix="qrlsuite-plugins-", ignore_cleanup_errors=True)
+    atexit.register(temporary.cleanup)
+    return Path(temporary.name)
 
 
 def copy(source: Source, folder: Path) -> Path:
