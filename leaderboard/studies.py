@@ -148,7 +148,7 @@ def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
     """
     by_task: dict[str, list[EntryResults]] = {}
     for entry in entries:
-        if entry.plan is None:
+        if entry.study is None:
             by_task.setdefault(entry.task_hash, []).append(entry)
     counts = [(0, 0)]
     for group in by_task.values():
@@ -202,7 +202,17 @@ def draw(
         if (not section.entries or member.group in section.entries)
         and (not selection.tasks or member.entry.task.name in selection.tasks)
     ]
+    if not members:
+        raise OptionError(f"study '{name}' has no entry{selection.of_tasks}")
     data = pictures.KINDS[section.kind].data
+    if data == "deployed" and section.evaluation is None:
+        raise OptionError(
+            f"picture '{kind}' is drawn where a study's file says what is evaluated, as `deploy` does"
+        )
+    if data == "deployed" and (seeds is not None or horizon is not None):
+        raise OptionError(
+            f"picture '{kind}' plays the best agents of all seeds: leave --seeds and --horizon out"
+        )
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: {drawn_by(name, section, members, selection.runs)}")
     folder = selection.runs if study.looks is None else read_outcome(name, selection.runs).study.folder
@@ -212,10 +222,10 @@ def draw(
         hint *= not selection.published and data == "entries"
         raise UnknownNameError(f"study '{study.name}' has no seeds yet: qrlsuite study run {name}{hint}")
     entries, short = collect.equally_long(entries)
+    own = {**section.settings, **settings}
     if data == "deployed":
-        drawn = Composed(_deployed(section, entries), tuple(entries))
+        drawn = Composed(_deployed(section, entries, own), tuple(entries))
     else:
-        own = {**section.settings, **settings}
         drawn = compose(
             section.kind, selection.of(), entries, horizon=horizon, seeds=seeds, settings=own, environment={}
         )
@@ -250,12 +260,12 @@ def _of_looks(kind: str, names: Sequence[str], runs: Path) -> Composed:
     return Composed(drawing.draw(outcomes[0]) if kind == "pairs" else drawing.draw_entries(outcomes[0]))
 
 
-def _deployed(picture: PictureSection, entries: Sequence[EntryResults]) -> Figure:
+def _deployed(picture: PictureSection, entries: Sequence[EntryResults], own: Mapping[str, Any]) -> Figure:
     """Play the entries' best runs as trained, and runs with a circuit on the backend at every value.
 
     Episodes on the backend are stored in the entries' folders, and not played again.
     """
-    assert picture.evaluation is not None  # `check` saw to it, and to the next
+    assert picture.evaluation is not None  # `draw` and `check` saw to it, and to the next
     assert picture.evaluation.deployed is not None
     from qrlsuite.leaderboard.pictures import cells  # matplotlib, which is needed for drawing alone
 
@@ -282,7 +292,7 @@ def _deployed(picture: PictureSection, entries: Sequence[EntryResults]) -> Figur
         lines.append(drawing.Line(trained, tuple(elsewhere)))
     from qrlsuite.leaderboard.pictures import style
 
-    settings = {"title": style.heading(entries), "axis": where.vary, **picture.settings}
+    settings = {"title": style.heading(entries), "axis": where.vary, **own}
     return drawing.draw(
         lines, [f"{value:,}" if type(value) is int else f"{value}" for value in where.values], **settings
     )

@@ -114,7 +114,7 @@ def compare_entries(
     if edited := edited_between(first, second):
         raise QrlSuiteError(edited)
     for entry in (first, second):
-        if entry.plan:
+        if entry.study:
             raise QrlSuiteError(f"'{entry.label}' was {WITH_LOOKS}")
         if entry.chosen_seeds:
             raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")

@@ -312,7 +312,7 @@ def on_board(
     end = min(each.curves.shape[1] * each.steps_per_epoch for each in (first, second))
     ranked = []
     for entry in entries:
-        if entry.plan or entry.task_hash != first.task_hash or end % entry.steps_per_epoch:
+        if entry.study or entry.task_hash != first.task_hash or end % entry.steps_per_epoch:
             continue
         reached = entry.reaching(end // entry.steps_per_epoch)
         if reached is not None and len(reached.seeds) >= MIN_RUNS:

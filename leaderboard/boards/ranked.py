@@ -70,9 +70,9 @@ def of_one_definition(
     tuple
         The entries that stay, task by task, and one line for each entry that was left out.
     """
-    problems = [f"{entry.folder}: {WITH_LOOKS}" for entry in entries if entry.plan]
+    problems = [f"{entry.folder}: {WITH_LOOKS}" for entry in entries if entry.study]
     problems += [f"{entry.folder}: {entry.chosen_seeds}" for entry in entries if entry.chosen_seeds]
-    fixed = [entry for entry in entries if not entry.plan and not entry.chosen_seeds]
+    fixed = [entry for entry in entries if not entry.study and not entry.chosen_seeds]
     kept = []
     for task in sorted({entry.task for entry in fixed}):
         members = [entry for entry in fixed if entry.task == task]

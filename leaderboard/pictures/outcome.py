@@ -35,7 +35,7 @@ LOOKS: dict[Decided | None, tuple[str, str, str]] = {
     Decided.NOT_TOLD_APART: ("not told apart", GRAY, "v"),
     None: ("open", GRAY, "x"),
 }
-"""Text of the legend, color and marker, by a pair's decision."""
+"""Text of the legend, color and marker, by how a pair was closed."""
 
 
 def draw(outcome: State) -> Figure:
@@ -206,7 +206,7 @@ def _ratios(axes: Axes, ends: Sequence[float], margin: float) -> None:
 
 
 def _legend(axes: Axes, pairs: Sequence[PairDecision]) -> None:
-    """Add a legend of the pairs' decisions."""
+    """Add a legend of the verdicts."""
     for each, (label, color, marker) in LOOKS.items():
         if any(pair.decided is each for pair in pairs):
             axes.plot([], [], marker, color=color, label=label, ls="none")

@@ -110,7 +110,7 @@ def _commands(entry: EntryResults) -> list[tuple[str, str]]:
     Curves of other programs, and tasks that are not installed, have none.
     """
     changed = changed_options(entry)
-    if entry.external or entry.plan or changed is None:
+    if entry.external or entry.study or changed is None:
         return []
     task = [
         entry.task.partition("+")[0],

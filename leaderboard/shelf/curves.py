@@ -173,7 +173,7 @@ class EntryResults(Shown):
         return self.record.tuned
 
     @property
-    def plan(self) -> str | None:
+    def study(self) -> str | None:
         """Hash of the study with looks that trained it; None for a number of seeds that was fixed in advance."""
         return self.record.plan
 

@@ -97,17 +97,17 @@ def sources(folder: Path) -> list[EntryStore]:
     return stores
 
 
-def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imported:
+def import_seeds(source: EntryStore, runs: Path, study: str | None = None) -> Imported:
     """Copy the seeds of an entry that are not in a results folder yet.
 
     Parameters
     ----------
-    plan:
+    study:
         Hash of the study with looks that the results folder belongs to, if it does.
     """
     exported = published.read(source.path) if published.is_published(source.path) else None
     entry = source.entry()  # computes the hash anew
-    if entry.plan != plan:
+    if entry.study != study:
         raise StoreError(
             f"{source.path} belongs to a study with looks, whose number of seeds depends on what they showed: it is "
             "continued by the study alone"
@@ -306,7 +306,7 @@ def _of_export(
         made.write_record(
             RunRecord.model_validate(
                 {
-                    **({} if entry.plan is None else {"plan": entry.plan}),
+                    **({} if entry.study is None else {"plan": entry.study}),
                     "task": entry.task.name,
                     "task_hash": entry.task.hash,
                     "entry": entry.name,

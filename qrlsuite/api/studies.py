@@ -113,7 +113,7 @@ def _plugins_of(study: Study, file: Path) -> str:
 def read_study(
     name: str, *more: str, runs: str | PathLike[str] = "runs", published: bool = False
 ) -> Overview | State | StudiesTogether:
-    """Read a study's progress: its trained and missing seeds, or the decisions of its looks. Trains nothing.
+    """Read a study's progress: its trained and missing seeds, or the verdicts of its looks. Trains nothing.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def run_study(
 
     Entries and their folders are those of `train`: nothing is trained twice. A study with looks has seeds of its own,
     which are trained look by look, until every pair is decided or the last look was taken. Interrupt it at any time:
-    the same call continues, and ends with the same decisions.
+    the same call continues, and ends with the same verdicts.
 
     Parameters
     ----------
@@ -232,12 +232,12 @@ def run_study(
     if study.looks is not None:
         require_unchanged(name, chosen)
         return take_looks(study, where, budget, runs, progress)
-    [planned], _ = plan(name, options, models, several(only), seeds, epochs, where, runs)
-    [done] = train_studies([planned], where, budget, progress)
+    [found], _ = find_studies(name, options, models, several(only), seeds, epochs, where, runs)
+    [done] = train_studies([found], where, budget, progress)
     return done
 
 
-def plan(
+def find_studies(
     name: str,
     options: Mapping[str, Any] | None,
     models: Mapping[str, str] | None,
@@ -260,22 +260,22 @@ def plan(
         If there is no such study or entry, or one of all studies is broken by itself.
     """
     changes = from_mapping(options)
-    planned, refusals = list[Overview](), list[OptionError]()
+    found, refusals = list[Overview](), list[OptionError]()
     for study in map(studies.find, registry.load().names(specs.StudySpec) if name == ALL else [name]):
         try:
             members = study_runner.select(study, changes, models, only)
         except OptionError as error:
             refusals.append(error)
         else:
-            planned.append(overview(study, members, Path(runs), where, seeds, epochs))
-    if not planned:
+            found.append(overview(study, members, Path(runs), where, seeds, epochs))
+    if not found:
         raise refusals[0]
-    planned.sort(key=lambda each: sum(work.left for work in each.works))
-    return planned, [str(error) for error in refusals]
+    found.sort(key=lambda each: sum(work.left for work in each.works))
+    return found, [str(error) for error in refusals]
 
 
 def train_studies(
-    planned: Sequence[Overview], where: Where, budget: str | None, progress: bool
+    every: Sequence[Overview], where: Where, budget: str | None, progress: bool
 ) -> Iterator[Overview]:
     """Train study after study within one budget; return what each has and lacks then.
 
@@ -288,10 +288,10 @@ def train_studies(
     """
     console = Console(stderr=True, quiet=not progress, highlight=False, soft_wrap=True, markup=False)
     missing.check_budget(budget, where)
-    works, began = [work for each in planned for work in each.works], time.monotonic()
+    works, began = [work for each in every for work in each.works], time.monotonic()
     missing.places(works[0].runs, [work.entry for work in works], where, quiet=not progress)
-    for each in planned:
-        if len(planned) > 1:
+    for each in every:
+        if len(every) > 1:
             console.print(f"\nstudy {each.study.name}: {each.study.summary}")
         now = each.now(where)
         submitted = study_runner.train_missing(now.works, where, budget, began, not progress)
@@ -306,7 +306,7 @@ def end_study(name: str, *, runs: str | PathLike[str] = "runs") -> None:
 def take_looks(
     study: StudyFile, where: Where, budget: str | None, runs: str | PathLike[str], progress: bool
 ) -> State:
-    """Train a study with looks until all pairs are decided; print the decisions of every look."""
+    """Train a study with looks until all pairs are decided; print the verdicts of every look."""
     missing.check_budget(budget, where)
     return study_runner.take_looks(Study(study, Path(runs)), where, budget, not progress)
 

@@ -83,7 +83,7 @@ def places(
             store = codes.place(runs, entry, code)
         elif before is not None and codes.of(store) is None:
             seeds = f"{before.path} has seeds {format_seeds(before.seeds())} of another code"
-            if entry.plan is not None:
+            if entry.study is not None:
                 raise codes.ChangedCodeError(
                     f"{seeds}: {codes.change(before, code)}. Nothing was trained. Restore that code, or write another "
                     'study; and --same "REASON" says that nothing changed in effect'

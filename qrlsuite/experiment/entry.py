@@ -38,7 +38,7 @@ class Entry:
         The preset that supplied defaults; not part of the identity, its values are.
     tuning:
         How the settings were found, where their preset says so; not part of the identity either.
-    plan:
+    study:
         Hash of the study with looks that trains it, where one does; not part of the identity either.
     start:
         `TASK/ENTRY:EPOCHS` if training begins with the agents of another entry after so many epochs, seed k with that
@@ -52,7 +52,7 @@ class Entry:
     model_options: Any
     preset: str | None
     tuning: dict[str, Any] | None = field(default=None, compare=False)
-    plan: str | None = field(default=None, compare=False)
+    study: str | None = field(default=None, compare=False)
     start: str | None = None
 
     @property

@@ -328,7 +328,7 @@ class EntryRecord(CodedRecord):
     def of(cls, entry: Entry) -> EntryRecord:
         """Return the record of an entry."""
         tuned = {} if entry.tuning is None else {"tuning": entry.tuning}
-        planned = {} if entry.plan is None else {"plan": entry.plan}
+        planned = {} if entry.study is None else {"plan": entry.study}
         file = entry.task.file.model_dump(mode="json", exclude={"tuning"})
         if entry.task.name in registry.load().of(specs.TaskSpec):
             file["ranking"].pop("policies", None)  # boards read the registered file; 0.1.1 knows no such key
@@ -380,7 +380,7 @@ class EntryRecord(CodedRecord):
             model_options=model_options,
             preset=self.preset,
             tuning=self.tuned,
-            plan=self.plan,
+            study=self.plan,
             start=self.identity.start,
         )
         if entry.hash != self.hash:

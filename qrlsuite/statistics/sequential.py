@@ -37,7 +37,7 @@ from qrlsuite.statistics.times_board import direction, log_ratios
 RULES = ("times", "times-skewed")
 """Rules that may judge the pairs of a design."""
 MOST_RELABELINGS = 200_000
-"""At levels below 1e-4 a decision needs p = 1 / 200,001 or so; at levels below that there is none."""
+"""At levels below 1e-4 a difference needs p = 1 / 200,001 or so; at levels below that there is none."""
 _POINTS = 1001  # of the numerical integration
 _TAIL = 9.0  # standard deviations beyond which a density is nothing
 
@@ -164,7 +164,7 @@ def _simpson(low: float, high: float) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class SequentialDesign:
-    """The plan that is fixed before the first run: pairs, looks, and error.
+    """A study as it is fixed before the first run: pairs, looks, and error.
 
     Attributes
     ----------
@@ -209,7 +209,7 @@ class SequentialDesign:
 
     def __post_init__(self) -> None:
         if len(self.entries) < 2:
-            raise OptionError(f"entries = {list(self.entries)}: a decision needs two or more")
+            raise OptionError(f"entries = {list(self.entries)}: a study needs two or more")
         for index, name in enumerate(self.entries):
             if name in self.entries[:index]:
                 raise OptionError(f"entries: the name '{name}' is repeated")
@@ -351,7 +351,7 @@ class Decision:
     design:
         The design.
     pairs:
-        The planned pairs, in order.
+        The pairs of the design, in order.
     wanted:
         For each entry with an open pair: the runs that the next look needs. Empty when all is decided.
     """
@@ -429,7 +429,7 @@ def next_look(
     design, look:
         The design, and which of its looks.
     studies:
-        For each study the planned pairs as the look before left them.
+        For each study the pairs as the look before left them.
     times:
         For each study the times of its entries, (N, E) with N at least the look's runs.
     """

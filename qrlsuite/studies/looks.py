@@ -8,7 +8,7 @@ own, in a folder of its own:
                             looks.jsonl         times of the first seed and of each look, and the look's results
                             <task>/<entry>/...  as in any results folder; each seed's record has the study's hash
 
-Decisions follow from the study and the curves alone. The log decides nothing: it has the time of each look, and reveals
+Verdicts follow from the study and the curves alone. The log decides nothing: it has the time of each look, and reveals
 curves that were changed after it. Leaderboards do not read this folder: if the number of seeds depends on results, the
 p-value of a fixed number of seeds does not hold.
 """
@@ -94,7 +94,7 @@ class Study:
         tables = self.file.entries
         names = tuple(table.name or name for table, name in zip(tables, _names([m.entry for m in members])))
         own = [
-            replace(m.entry, plan=self.hash, tuning=table.tuning.plain() if table.tuning else m.entry.tuning)
+            replace(m.entry, study=self.hash, tuning=table.tuning.plain() if table.tuning else m.entry.tuning)
             for m, table in zip(members, tables)
         ]
         self.entries: dict[str, Entry] = dict(zip(names, own))
@@ -255,9 +255,9 @@ class Study:
                     hours[name] += folder.seconds() / 3600
         return self.state(trained, hours, begun)
 
-    def require_own(self, name: str, seed: int, plan: str | None) -> None:
+    def require_own(self, name: str, seed: int, study: str | None) -> None:
         """Refuse a seed of the block that another study, or none, has trained."""
-        if seed in self.looks.block and plan != self.hash:
+        if seed in self.looks.block and study != self.hash:
             path = EntryStore.find(self.folder, self.entries[name]).seed(seed).path
             raise StoreError(
                 f"{path}: seed {seed} of '{name}' was not trained by study {self.hash}; delete that folder, and the "

@@ -263,7 +263,7 @@ def train_missing(
 def take_looks(study: Study, where: Where, budget: str | None, quiet: bool) -> State:
     """Train the seeds of each look and take it, until every pair is closed, or others have the seeds.
 
-    Unless it is quiet, it prints the decisions of every look.
+    Unless it is quiet, it prints the verdicts of every look.
     """
     places(study.folder, list(study.entries.values()), where, quiet)
     study.begin()
@@ -281,7 +281,7 @@ def take_looks(study: Study, where: Where, budget: str | None, quiet: bool) -> S
 
 
 def _say_look(decision: Decision, console: Console) -> None:
-    """Print the decisions of the newest look, while more is trained."""
+    """Print the verdicts of the newest look, while more is trained."""
     looks = max((len(pair.p) for pair in decision.pairs), default=0)
     if not looks:
         return

@@ -88,7 +88,7 @@ class State(Shown):
 
     @property
     def pairs(self) -> tuple[PairDecision, ...]:
-        """The compared pairs; `verdict` is a pair's decision in words."""
+        """The compared pairs; `verdict` is its words."""
         return self.decision.pairs
 
     @property

@@ -164,7 +164,7 @@ class GroupFiles:
                 folder.write_record(record.changed(probe=probe))
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
-        planned = {} if self.entry.plan is None else {"plan": self.entry.plan}
+        planned = {} if self.entry.study is None else {"plan": self.entry.study}
         return {
             **planned,
             "task": self.entry.task.name,

@@ -343,6 +343,9 @@ plot barz --study fig6 => study 'fig6' has no picture 'barz'; did you mean 'bars
 plot bars --study fig6 --entry mlp => --study fig6 names the entries
 plot bars --study fig6 --study fig7 => picture 'bars' shows one study: leave fig7 out
 plot histogram --study fig8 => drawn by: qrlsuite evaluate 'ddqn mlp width=64' 'ddqn vqc-native qubits=14' --task beam6g
+plot deployed --study fig6 => drawn where a study's file says what is evaluated
+plot shots --study deploy --seeds 3 => plays the best agents of all seeds: leave --seeds
+plot bars --study fig6 --task cartpole --runs . => study 'fig6' has no entry of task cartpole
 plot entries --study memory --study quantum-or-not => picture 'entries' shows one study
 study end fig6 => study 'fig6' has no looks
 study new p.toml --task tiny.toml mlp => a study with looks needs two or more entries

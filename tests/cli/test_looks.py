@@ -62,7 +62,7 @@ def put(store: EntryStore, seed: int, epochs: int, start: int) -> None:
     timings = [json_line({"epoch": t, "cpu": 36 / epochs}) for t in range(1, epochs + 1)]
     folder.timings.write_bytes(b"".join(timings))
     entry = store.entry()
-    record = RunRecord(plan=entry.plan, seed=seed, **store.names, status="finished", epochs=epochs)
+    record = RunRecord(plan=entry.study, seed=seed, **store.names, status="finished", epochs=epochs)
     folder.write_record(record.changed(code=identity.of(entry).record()))
 
 
@@ -445,7 +445,7 @@ def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:
 def test_every_record_of_a_seed_has_the_hash_of_its_study() -> None:
     entry = _entry("width=4")
     tables = []
-    for runs, subject in (("planned", replace(entry, plan="ab" * 8)), ("runs", entry)):
+    for runs, subject in (("planned", replace(entry, study="ab" * 8)), ("runs", entry)):
         store = EntryStore.create(Path(runs), subject)
         train_group(store.path, [0], 1)
         expected = {"plan": "ab" * 8} if runs == "planned" else {}

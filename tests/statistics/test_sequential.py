@@ -208,7 +208,7 @@ def test_degenerate_pairs_are_closed() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"entries": ("a",)}, "a decision needs two or more"),
+        ({"entries": ("a",)}, "a study needs two or more"),
         ({"entries": ("a", "a")}, "the name 'a' is repeated"),
         ({"looks": (40, 20)}, r"looks = \[40, 20\]: each must be at more runs"),
         ({"looks": ()}, "looks"),

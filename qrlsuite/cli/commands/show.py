@@ -51,7 +51,7 @@ def show(
     """Show options with their defaults and meaning, a task's protocol, how far a study is, or how an entry was made.
 
     A study is given by name, or as its file or the folder of a published one. Of a study you see the seeds that are
-    finished and the cost of the missing ones; of a study with looks the decisions, and the needs of open pairs; of
+    finished and the cost of the missing ones; of a study with looks the verdicts, and the needs of open pairs; of
     several, each of another task, the pairs that all of them compare, on average over the tasks.
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp qubits=4;

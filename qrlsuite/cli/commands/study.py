@@ -13,7 +13,7 @@ from qrlsuite.api.arguments import where_of
 from qrlsuite.api.studies import (
     ALL,
     end_study,
-    plan,
+    find_studies,
     require_unchanged,
     take_looks,
     train_studies,
@@ -151,11 +151,11 @@ def run(
         outcome = take_looks(study, where, budget, runs, not json_output)
         _report(name, outcome, budget, runs, json_output)
         return
-    planned, left_out = plan(name, *_changes(words), seeds, epochs, where, runs)
+    chosen, left_out = find_studies(name, *_changes(words), seeds, epochs, where, runs)
     for line in left_out:
         typer.echo(f"left out: {line}", err=True)
     done = []
-    for found in planned if dry_run else train_studies(planned, where, budget, not json_output):
+    for found in chosen if dry_run else train_studies(chosen, where, budget, not json_output):
         done.append(found.as_dict())
         if dry_run and not json_output:
             table_console().print(found, soft_wrap=True)
