@@ -208,14 +208,6 @@ def test_ctrl_c_between_groups_changes_no_decision() -> None:
         assert len(Scripted.trained) == 5, "nothing is trained twice"
 
 
-def test_a_budget_ends_between_groups_and_the_same_command_continues() -> None:
-    write()
-    said = say("study", "run", "widths.toml", "--engine", "scripted", "--budget", "0.001s").stdout
-    assert "the budget is used up, or others train 20 seeds of mlp width=16" in said
-    assert Scripted.trained == []
-    assert run("widths.toml", "--budget", "1h")["finished"]
-
-
 def test_a_study_goes_on_with_the_code_that_began_it(
     refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -635,14 +627,6 @@ def test_a_damaged_published_study_is_refused(exported: Path, refused: Refused) 
     assert "was not trained by study" in refused("show", str(exported))
     assert "holds another study" in refused("export", "p.toml", "--out", "plans")
     assert "by commands of their own" in refused("export", "p.toml", "mlp width=16")
-
-
-def test_looks_below_20_seeds_are_marked() -> None:
-    write("mlp width=16", "mlp width=4", "--looks", "10,20 reason='runs are dear'")
-    assert "NOTE: it looks below 20 seeds" in (shown := say("show", "widths.toml").stdout)
-    assert "Reason given: runs are dear" in shown
-    run()
-    assert "Reason given: runs are dear" in say("show", "widths.toml").stdout
 
 
 def test_a_published_study_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,6 @@ from qrlsuite.specs import EngineSpec, StudySpec
 from qrlsuite.studies.runner import find_missing
 from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, results
-from tests.core.test_study import EXPECTED
 from tests.leaderboard import boards
 
 STUDY = """
@@ -114,6 +113,7 @@ def widths(tmp_path: Path) -> str:
     return str(path)
 
 
+STUDIES = [name for name, each in registry.load().of(StudySpec).items() if each.distribution == "qrlsuite"]
 ALIKE = ("fig6", "fig7", "cartpole", "ppo", "ablation", "degree", "ansatz", "stacking", "fidelity", "buffer")
 """Studies whose pictures are of kinds that others have, too."""
 SIZES = {"qubits": "[2, 3]", "layers": "[1, 2]", "width": "[4, 8]", "depth": "[1, 2]", "shots": "[2, 4]"}
@@ -149,7 +149,7 @@ def reduced(name: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] if name in ALIKE else []) for name in EXPECTED]
+    "name", [pytest.param(name, marks=[pytest.mark.long] if name in ALIKE else []) for name in STUDIES]
 )
 def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
     seeds = 2
@@ -400,7 +400,7 @@ def test_which_pairs_count() -> None:
 
 def test_listing() -> None:
     listed = say("list", "studies").stdout
-    assert all(name in listed for name in (*EXPECTED, *published_studies.names()))
+    assert all(name in listed for name in (*STUDIES, *published_studies.names()))
     shown = say("show", "fig7", "--runs", "nowhere").stdout
     assert "ddqn vqc-native qubits=14" in shown
     assert "0/100" in shown

@@ -25,29 +25,14 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks()
     assert found["seeds"] == [20, 20, 20]
     assert {"10 qubits", "width 14"} <= set(found["changed"]), "untuned on beam6g, tuned elsewhere"
     assert answer("show", *TOGETHER[1:])["changed"] == []
-    families = [{(pair["first"], pair["second"]) for pair in each.as_dict()["pairs"]} for each in outcomes]
-    assert [(pair["first"], pair["second"]) for pair in found["pairs"]] == [
-        (pair["first"], pair["second"])
-        for pair in outcomes[0].as_dict()["pairs"]
-        if all((pair["first"], pair["second"]) in family for family in families)
-    ]
-    for pair in found["pairs"]:
-        logs = []
-        for each in outcomes:
-            first, second = (
-                np.mean([each.curves[pair[side]].values[:20] < t for t in each.study.grid.thresholds])
-                for side in ("first", "second")
-            )  # of all epochs: a pair that went on counts with its first look, too
-            logs.append(math.log(second / first))
-        assert list(pair["differences"].values()) == pytest.approx(np.expm1(logs))
-        assert pair["difference"] == pytest.approx(math.expm1(np.mean(logs)))
-        assert pair["interval"][0] < pair["difference"] < pair["interval"][1]
-    went_on = next(pair for pair in found["pairs"] if pair["second"] == "width 32")
-    last_look = next(
-        pair for pair in outcomes[0].pairs if (pair.first, pair.second) == ("10 qubits", "width 32")
-    )
-    assert last_look.n_runs == 100
-    assert went_on["differences"]["beam6g"] != pytest.approx(last_look.difference, abs=1e-6)
+    pair = next(each for each in found["pairs"] if each["second"] == "width 32")
+    first, second = (
+        np.mean([outcomes[0].curves[pair[side]].values[:20] < t for t in outcomes[0].study.grid.thresholds])
+        for side in ("first", "second")
+    )  # of all epochs
+    own = next(each for each in outcomes[0].pairs if (each.first, each.second) == ("10 qubits", "width 32"))
+    assert own.n_runs == 100, "it went on, and counts with its first look"
+    assert pair["differences"]["beam6g"] == pytest.approx(second / first - 1)
     shown = say("show", "study", *TOGETHER).stdout
     assert "nothing follows for other tasks" in shown
     assert shown.count("10 qubits / width 14") == 1

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import registry, specs
 from qrlsuite.errors import FileError, OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
@@ -36,82 +35,6 @@ match = { option = "width", group = "vqc" }
 [[pictures]]
 kind = "curves"
 """
-DEGREES = ("beam6g", "beam6g-degree4", "beam6g-degree5", "beam6g-degree6")
-PLACEMENTS = [f"beam6g-a{antennas}-{index}" for antennas in (2, 3, 4, 5) for index in range(5)]
-
-
-def labels(name: str) -> list[str]:
-    return sorted({f"{m.entry.task.name} {m.entry.label}" for m in study.load(name).members()})
-
-
-def mlps(algorithm: str, widths: tuple[int, ...], task: str = "beam6g") -> list[str]:
-    return [f"{task} {algorithm} mlp width={width}" for width in widths]
-
-
-def vqcs(algorithm: str, qubits: tuple[int, ...], task: str = "beam6g") -> list[str]:
-    return [f"{task} {algorithm} vqc-native qubits={n}" for n in qubits]
-
-
-EXPECTED = {
-    "fig1": mlps("ddqn", (16, 64)) + vqcs("ddqn", (14,)),
-    "fig6": mlps("ddqn", (16, 32, 64)) + vqcs("ddqn", (10, 14)),
-    "fig7": mlps("ddqn", (16, 32, 64, 128, 256)) + vqcs("ddqn", (6, 8, 10, 12, 14)),
-    "fig8": mlps("ddqn", (64,)) + vqcs("ddqn", (14,)),
-    "cartpole": [
-        "cartpole reinforce mlp width=16 depth=1",
-        "cartpole reinforce vqc-native qubits=4 layers=1",
-    ],
-    "ppo": mlps("ppo", (16, 32, 64)) + vqcs("ppo", (10,)),
-    "ablation": mlps("ddqn", (16, 32, 64, 128, 256))
-    + [f"beam6g ddqn mlp width={w} depth={d}" for w in (32, 64) for d in (1, 3, 4)]
-    + vqcs("ddqn", (6, 8, 10, 12, 14))
-    + [f"beam6g ddqn vqc-native qubits={n} layers={k}" for n in (8, 10) for k in (3, 5, 6)],
-    "degree": [
-        text for task in DEGREES for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
-    ],
-    "antennas": [
-        text for task in PLACEMENTS for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
-    ],
-    "ansatz": [
-        f"beam6g ddqn vqc-native qubits=10{' ansatz=' + a if a != 'iqp' else ''}{' gate=' + g if g != 'rot' else ''}"
-        for a in ("iqp", "cx", "cz")
-        for g in ("rot", "xyz", "u3")
-    ],
-    "few-runs": mlps("ddqn", (32, 64)),
-    "matched": mlps("ddqn", (10, 11, 12, 13, 14)) + vqcs("ddqn", (6, 7, 8, 9, 10)),
-    "deploy": mlps("ddqn", (10, 16)) + vqcs("ddqn", (6, 10)),
-    "shots": vqcs("ddqn", (4,))
-    + [
-        f"beam6g ddqn vqc-native qubits=4 shots={n}{gradient}"
-        for gradient in ("", " gradient=spsa")
-        for n in (100, 1000, 10000)
-    ],
-    "stacking": [
-        text
-        for task in ("beam6g", "beam6g+7d1167f1")
-        for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
-    ],
-    "buffer": [
-        text + change
-        for change in ("", " buffer=10000")
-        for text in mlps("ddqn", (16, 32, 64)) + vqcs("ddqn", (10,))
-    ],
-    "fidelity": [
-        text + change
-        for task, change in (
-            ("beam6g", ""),
-            ("beam6g+476ac3d2", ""),
-            ("beam6g", " buffer=1000 target_steps=1000"),
-        )
-        for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
-    ],
-}
-
-
-def test_studies_have_the_entries_of_the_paper() -> None:
-    known = registry.load().of(specs.StudySpec).items()
-    assert {name for name, found in known if found.distribution == "qrlsuite"} == set(EXPECTED)
-    assert {name: labels(name) for name in EXPECTED} == {name: sorted(EXPECTED[name]) for name in EXPECTED}
 
 
 def test_entries_are_those_of_plain_runs() -> None:
