@@ -285,9 +285,9 @@ def _file(shown: str, place: Path) -> dict[str, bytes]:
             file = (place.parent / name).parent / data
             if not file.resolve().is_relative_to(place.parent.resolve()):
                 raise PluginError(f"plugin {shown}: files names {data}, which is not in {place.parent}")
-            found[file.relative_to(place.parent).as_posix()] = _bytes(
-                f"{shown}: files names {data}, and it", file
-            )
+            if not file.is_file():
+                raise PluginError(f"plugin {shown}: files names {data}, and there is no such file")
+            found[file.relative_to(place.parent).as_posix()] = _bytes(shown, file)
         left |= {file: content for file, content in found.items() if file not in files}
     return files
 
@@ -306,7 +306,9 @@ def _declared(tree: ast.Module) -> Iterator[str]:
     for node in tree.body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         value = getattr(node, "value", None)
-        if any(getattr(each, "id", None) == "files" for each in targets) and isinstance(value, ast.List):
+        if any(getattr(each, "id", None) == "files" for each in targets) and isinstance(
+            value, ast.List | ast.Tuple
+        ):
             yield from (str(each.value) for each in value.elts if isinstance(each, ast.Constant))
 
 
@@ -544,7 +546,7 @@ def _words(error: BaseException) -> str:
     """Return an error of a plugin's code in words, in a line."""
     more = ""
     if isinstance(error, FileNotFoundError) and _is_copy(str(error.filename)):
-        file = Path(error.filename).name
+        file = "/".join(Path(error.filename).relative_to(_cache()).parts[1:])
         more = f'; no such file belongs to the plugin: declare it at the top of the code, files = ["{file}"]'
     return _shown(" ".join(registry.words(error).split())[:_MOST_WORDS] + more)
 
@@ -576,7 +578,7 @@ def _line(file: str, module: Any, line: int) -> str:
     for source in _sources():
         if Path(file).is_relative_to(source.copy.parent):
             name = Path(file).relative_to(source.copy.parent).as_posix()
-            text = source.files[name].decode(errors="replace").splitlines()[line - 1 : line]
+            text = source.files.get(name, b"").decode(errors="replace").splitlines()[line - 1 : line]
             return f"{name}, line {line}" + "".join(f": {each.strip()}" for each in text)
     if str(module).partition(".")[0] not in _installed() - {hookspecs.PROJECT}:
         return ""

@@ -15,6 +15,7 @@ nothing of an entry. Tests and documents of a package are no part of it.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import sys
@@ -215,15 +216,22 @@ def _installed(roots: Sequence[str], distribution: str) -> dict[str, str]:
     """Return all files that a plugin by path has, or that a distribution installs in its packages."""
     if own.of_distribution(distribution) is not None:
         files = {name: content for each in _by_path(roots) for name, content in each.files.items()}
-        return source.digests(files)
-    found = {}
+        return {name: source.digest(name, files[name]) for name in sorted(files) if source.counts(name)}
+    found: dict[str, str] = {}
     for top in {root.partition(".")[0] for root in roots} | _listed(distribution):
         spec = source.find(top)
         if spec is not None and spec.origin is not None and spec.submodule_search_locations is not None:
             folder = Path(spec.origin).parent
-            for path in own.walk(folder):
-                found[f"{top}/{path.relative_to(folder).as_posix()}"] = path.read_bytes()
-    return source.digests(found)
+            names = {f"{top}/{path.relative_to(folder).as_posix()}": path for path in own.walk(folder)}
+            for name in filter(source.counts, names):
+                found[name] = _digest(names[name], names[name].stat().st_mtime_ns)
+    return dict(sorted(found.items()))
+
+
+@functools.cache
+def _digest(path: Path, changed: int) -> str:
+    """Return the SHA-256 of a file as it was last changed; a study asks for it many times."""
+    return source.digest(path.name, path.read_bytes())
 
 
 def _listed(distribution: str) -> set[str]:

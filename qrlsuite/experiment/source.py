@@ -10,7 +10,7 @@ import ast
 import hashlib
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from importlib.machinery import ModuleSpec
 from typing import Any
 
@@ -19,7 +19,7 @@ _APART = re.compile(
     r"|(readme|license|licence|changelog|notice|authors)(\.\w+)?$)",
     re.IGNORECASE,
 )
-"""Tests and documents: nothing that is trained depends on these files of a package."""
+"""Tests and documents of a package."""
 
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -191,13 +191,14 @@ def _digest(content: bytes, tree: ast.Module | None) -> str:
     return hashlib.sha256(content if tree is None else _walked(tree)).hexdigest()
 
 
-def digests(files: Mapping[str, bytes]) -> dict[str, str]:
-    """Return the SHA-256 of a package's files, without tests and documents; of a Python file, that of its tree."""
-    return {
-        name: _digest(content, _tree(content, name))
-        for name, content in sorted(files.items())
-        if not _APART.search(name)
-    }
+def counts(name: str) -> bool:
+    """Return whether something that is trained may depend on a file of a package: no test, no document."""
+    return _APART.search(name) is None
+
+
+def digest(name: str, content: bytes) -> str:
+    """Return the SHA-256 of a file; of a Python file, that of its tree."""
+    return _digest(content, _tree(content, name))
 
 
 def _imports(tree: ast.Module, spec: ModuleSpec) -> Iterator[str]:

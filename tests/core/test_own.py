@@ -507,7 +507,7 @@ def test_undeclared_data_is_said_with_what_to_write() -> None:
     own.load(
         write("ring.py", f"files = ['data.txt']\n{head}{read}\ndef ring(qubits, layers) -> Circuit: ...\n")
     )
-    assert "files names none, and it" in refusal(write("net.py", "files = ['none']\n"))
+    assert "files names none, and there is no such file" in refusal(write("net.py", "files = ['none']\n"))
 
 
 def test_a_copy_that_was_changed_is_written_anew() -> None:
