@@ -7,7 +7,6 @@ group of seeds can be split and merged by slicing.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,29 +34,6 @@ class BuildModel(Protocol):
         role:
             Purpose of the network, `"actor"` or `"critic"`: passed on to a model that asks for it.
         """
-
-
-@dataclass(frozen=True)
-class Memory:
-    """The least memory of an algorithm; returned by the function `memory` of an `AlgorithmSpec`.
-
-    Attributes
-    ----------
-    networks:
-        How often `state_dict` holds a model's parameters: once, with Adam's two moments three times, and with a target
-        network four times.
-    batch:
-        Samples of one agent that pass through a network at a time.
-    saved:
-        Bytes of one agent that `state_dict` holds beside them, such as a replay buffer.
-    working:
-        Bytes of one agent that it does not hold, such as an epoch's random numbers.
-    """
-
-    networks: int = 1
-    batch: int = 1
-    saved: int = 0
-    working: int = 0
 
 
 class Algorithm(Protocol):

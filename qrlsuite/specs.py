@@ -172,10 +172,6 @@ class ModelSpec(NumericSpec):
         Reference to `population(modules, options) -> torch.nn.Module`: S built modules as one that maps
         (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
         `qrlsuite.population.stack`.
-    memory:
-        Reference to `memory(options, agents, batch, copies) -> int`: the least bytes of a population of `agents`, with
-        `copies` of all its parameters in memory, while every agent computes `batch` samples. A group that does not fit
-        is refused before training. None if unknown.
     faster:
         Name of a model that computes the same function much faster; recommended where training takes hours.
     backends:
@@ -189,7 +185,6 @@ class ModelSpec(NumericSpec):
     options: str
     build: str
     population: str | None = None
-    memory: str | None = None
     faster: str | None = None
     backends: bool = False
 
@@ -223,9 +218,6 @@ class AlgorithmSpec(NumericSpec):
         Reference to a pydantic dataclass.
     factory:
         Reference to the class: see `qrlsuite.algorithm.Algorithm`.
-    memory:
-        Reference to `memory(options, rounds) -> qrlsuite.algorithm.Memory`: its least memory if an epoch has `rounds`
-        steps of every environment. None if unknown.
     actions:
         The kinds of actions that it takes: some of `qrlsuite.actions.KINDS`.
     """
@@ -234,7 +226,6 @@ class AlgorithmSpec(NumericSpec):
 
     options: str
     factory: str
-    memory: str | None = None
     actions: tuple[str, ...] = field(default=("discrete",), kw_only=True)
 
     def __post_init__(self) -> None:

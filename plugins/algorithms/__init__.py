@@ -17,7 +17,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Double deep Q-learning with replay buffer and target network",
             options="qrlsuite.plugins.algorithms.ddqn:DDQNOptions",
             factory="qrlsuite.plugins.algorithms.ddqn:DDQN",
-            memory="qrlsuite.plugins.algorithms.ddqn:memory",
         )
     )
     register(
@@ -26,7 +25,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Deep recurrent Q-learning: double Q-learning on sequences, for models that remember",
             options="qrlsuite.plugins.algorithms.drqn:DRQNOptions",
             factory="qrlsuite.plugins.algorithms.drqn:DRQN",
-            memory="qrlsuite.plugins.algorithms.drqn:memory",
         )
     )
     register(
@@ -35,7 +33,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Proximal policy optimization, generalized advantages; on sequences for models that remember",
             options="qrlsuite.plugins.algorithms.ppo:PPOOptions",
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
-            memory="qrlsuite.plugins.algorithms.ppo:memory",
             actions=("discrete", "box", "multi-discrete", "multi-binary"),
         )
     )
@@ -45,7 +42,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="REINFORCE, the vanilla policy gradient, with or without a baseline",
             options="qrlsuite.plugins.algorithms.reinforce:REINFORCEOptions",
             factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
-            memory="qrlsuite.plugins.algorithms.reinforce:memory",
         )
     )
     register(
@@ -54,7 +50,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Soft actor-critic with a learned temperature, for continuous or discrete actions",
             options="qrlsuite.plugins.algorithms.sac:SACOptions",
             factory="qrlsuite.plugins.algorithms.sac:SAC",
-            memory="qrlsuite.plugins.algorithms.sac:memory",
             actions=("box", "discrete"),
         )
     )
@@ -64,7 +59,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Twin delayed deterministic policy gradient, for continuous actions",
             options="qrlsuite.plugins.algorithms.td3:TD3Options",
             factory="qrlsuite.plugins.algorithms.td3:TD3",
-            memory="qrlsuite.plugins.algorithms.td3:memory",
             actions=("box",),
         )
     )

@@ -31,7 +31,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite import masks
-from qrlsuite.algorithm import BuildModel, Memory
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, chosen_errors, chosen_values, part, prefixed
@@ -196,14 +196,3 @@ class DDQN:
         self._hold(state["observations"].clone().to(self.device))
         self.replay.rows.copy_(state["buffer"])
         self.replay.stored, self.epoch = (int(v) for v in state["counters"][0])
-
-
-def memory(options: DDQNOptions, rounds: int) -> Memory:
-    """Return one agent's memory: online and target network, Adam's moments, the buffer; and an epoch's draws from it.
-
-    The buffer's rows have float32 numbers of observations of 4 numbers: beam6g's are 3, CartPole's 4.
-    """
-    row = 4 * (2 * 4 + 3)
-    return Memory(
-        networks=4, batch=options.batch, saved=options.buffer * row, working=8 * rounds * options.batch
-    )

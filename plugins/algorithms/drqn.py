@@ -40,7 +40,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite import masks
-from qrlsuite.algorithm import BuildModel, Memory
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
@@ -269,13 +269,3 @@ class DRQN:
             state[name].clone().to(self.device) for name in ("begins", "remembered")
         )
         self.stored, self.epoch = (int(v) for v in state["counters"][0])
-
-
-def memory(options: DRQNOptions, rounds: int) -> Memory:
-    """Return one agent's memory: online and target network, Adam's moments, the buffer, an epoch's draws.
-
-    A row is computed for observations of 4 numbers, as CartPole's.
-    """
-    draws = rounds * options.updates * options.batch
-    steps = options.batch * (options.burn_in + options.length)
-    return Memory(networks=4, batch=steps, saved=options.buffer * 4 * 12, working=16 * draws)

@@ -63,7 +63,7 @@ from torch import Tensor, nn
 
 from qrlsuite import masks
 from qrlsuite.actions import choices, from_units, information_of_choices, size
-from qrlsuite.algorithm import BuildModel, Memory
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
@@ -636,8 +636,3 @@ def _normalized(advantages: Tensor) -> Tensor:
     if advantages.shape[1] < 2:
         return advantages - advantages  # a single sample is its own mean
     return (advantages - advantages.mean(1, keepdim=True)) / (advantages.std(1, keepdim=True) + 1e-8)
-
-
-def memory(options: PPOOptions, rounds: int) -> Memory:
-    """Return one agent's memory: actor and critic with Adam's moments of both."""
-    return Memory(networks=6, batch=min(options.batch, rounds))

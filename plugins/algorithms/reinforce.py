@@ -43,7 +43,7 @@ from torch import Tensor
 
 from qrlsuite import masks
 from qrlsuite.actions import information_of_choices
-from qrlsuite.algorithm import BuildModel, Memory
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Since, Tuned
@@ -358,8 +358,3 @@ class Reinforce:
         if self.options.epochs_per_update > 1:
             self.carried_ends.copy_(state["carried_ends"])
         self.epoch = int(state["epoch"][0])
-
-
-def memory(options: REINFORCEOptions, rounds: int) -> Memory:
-    """Return one agent's memory: a policy, a value network if it is the baseline, and Adam's moments."""
-    return Memory(networks=6 if options.baseline == "value" else 3, batch=min(BLOCK, rounds))

@@ -52,7 +52,7 @@ from torch import Tensor, nn
 
 from qrlsuite import masks
 from qrlsuite.actions import from_units, information_of_choices, size
-from qrlsuite.algorithm import BuildModel, Memory
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Tuned
@@ -367,12 +367,3 @@ class SAC:
         for name, each in self._parts().items():
             each.load_state_dict(part(state, name))
         self.epoch = int(state["epoch"][0])
-
-
-def memory(options: SACOptions, rounds: int) -> Memory:
-    """Return one agent's memory: three networks, the critics' copies, Adam's moments, the buffer, an epoch's draws.
-
-    A row is computed for an observation of 3 numbers and an action of one, as Pendulum's.
-    """
-    draws = rounds * options.updates * options.batch
-    return Memory(networks=11, batch=options.batch, saved=options.buffer * 4 * 9, working=16 * draws)

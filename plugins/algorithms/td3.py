@@ -43,7 +43,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite.actions import from_units, size
-from qrlsuite.algorithm import BuildModel, Memory
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, follow, gradients, part, prefixed
@@ -253,12 +253,3 @@ class TD3:
             each.load_state_dict(part(state, name))
         self.observations = state["observations"].clone().to(self.device)
         self.epoch, self.steps = (int(v) for v in state["counters"][0])
-
-
-def memory(options: TD3Options, rounds: int) -> Memory:
-    """Return one agent's memory: three networks, their copies and Adam's moments, the buffer, an epoch's draws.
-
-    A row is computed for an observation of 3 numbers and an action of one, as Pendulum's.
-    """
-    draws = rounds * options.updates * options.batch
-    return Memory(networks=12, batch=options.batch, saved=options.buffer * 4 * 9, working=12 * draws)

@@ -113,7 +113,7 @@ class CommandEngine:
         free = deque(range(1, works[0].workers + 1))
         outcome = EngineOutcome()
         for job in jobs:
-            job.progress.clear()
+            job.progress.clear(len(job.group.seeds))
         try:
             while waiting or running:
                 while waiting and free:

@@ -151,7 +151,7 @@ class DaskEngine:
         """Train the groups until all have finished or failed."""
         jobs = [WorkerJob(work, group, works) for work in works for group in work.groups]
         for job in jobs:
-            job.progress.clear()
+            job.progress.clear(len(job.group.seeds))
         with self.connected(works[0].workers) as cluster, contextlib.ExitStack() as stack:
             marks = {work.store.path: _mark(work.store, stack) for work in works}
             try:

@@ -20,7 +20,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             build="qrlsuite.plugins.models.mlp:build",
             population="qrlsuite.plugins.models.mlp:population",
             numerics=2,
-            memory="qrlsuite.plugins.models.mlp:memory",
         )
     )
     register(
@@ -31,7 +30,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.tmlp:TMLPOptions",
             build="qrlsuite.plugins.models.tmlp:build",
             population="qrlsuite.plugins.models.tmlp:population",
-            memory="qrlsuite.plugins.models.tmlp:memory",
         )
     )
     register(
@@ -43,7 +41,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             build="qrlsuite.plugins.models.fourier:build",
             population="qrlsuite.plugins.models.fourier:population",
             numerics=2,
-            memory="qrlsuite.plugins.models.fourier:memory",
         )
     )
     register(
@@ -64,7 +61,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
                 options="qrlsuite.plugins.models.recurrent:RecurrentOptions",
                 build=f"qrlsuite.plugins.models.recurrent:{name}",
                 population="qrlsuite.plugins.models.recurrent:population",
-                memory="qrlsuite.plugins.models.recurrent:memory",
             )
         )
     register(
@@ -84,7 +80,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.vqc:VQCOptions",
             build="qrlsuite.plugins.models.vqc:build",
             population="qrlsuite.plugins.models.vqc:population",
-            memory="qrlsuite.plugins.models.vqc:memory",
             faster="vqc-native",
             backends=True,
         )
@@ -97,7 +92,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.qlstm:QLSTMOptions",
             build="qrlsuite.plugins.models.qlstm:build",
             population="qrlsuite.plugins.models.qlstm:population",
-            memory="qrlsuite.plugins.models.qlstm:memory",
             faster="qlstm-native",
             backends=True,
         )
@@ -110,7 +104,6 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.qfwp:QFWPOptions",
             build="qrlsuite.plugins.models.qfwp:build",
             population="qrlsuite.plugins.models.qlstm:population",
-            memory="qrlsuite.plugins.models.vqc:memory",
             faster="qfwp-native",
             backends=True,
         )

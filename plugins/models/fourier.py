@@ -98,8 +98,3 @@ def build(obs_dim: int, out_dim: int, options: FourierOptions, generator: torch.
 def population(modules: Sequence[Fourier], options: FourierOptions) -> FourierPopulation:
     """Stack built models."""
     return FourierPopulation(modules)
-
-
-def memory(options: FourierOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of every sample's D angles and 2 D features, and of as many gradients."""
-    return 4 * agents * batch * options.frequencies * 2 * 3

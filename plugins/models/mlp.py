@@ -146,8 +146,3 @@ def build(obs_dim: int, out_dim: int, options: MLPOptions, generator: torch.Gene
 def population(modules: Sequence[MLP], options: MLPOptions) -> MLPPopulation:
     """Stack built perceptrons."""
     return MLPPopulation(modules, options)
-
-
-def memory(options: MLPOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of the square weights: (depth - 1) w^2 numbers of float32 per agent and copy, w the width."""
-    return 4 * agents * (options.depth - 1) * options.width**2 * copies

@@ -158,8 +158,3 @@ def population(modules: Sequence[Any], options: VQCOptions) -> nn.Module:
     states = [{**dict(m.named_parameters()), **dict(m.named_buffers())} for m in modules]
     stacked = {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
     return type(first)(runner, stacked, first.remembers, alone=False)
-
-
-def memory(options: QLSTMOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of circuit states in memory; 0 if unknown."""
-    return vqc.memory(options, GATES * agents, batch, copies)

@@ -163,8 +163,3 @@ def lstm(obs_dim: int, out_dim: int, options: RecurrentOptions, generator: torch
 def population(modules: Sequence[_Unit], options: RecurrentOptions) -> UnitPopulation:
     """Stack built units."""
     return UnitPopulation(modules, options)
-
-
-def memory(options: RecurrentOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of a `gru`'s square weights, 3 w^2 numbers of float32 per agent and copy; an `lstm` has more."""
-    return 4 * agents * 3 * options.width**2 * copies

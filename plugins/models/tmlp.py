@@ -143,8 +143,3 @@ def build(obs_dim: int, out_dim: int, options: TMLPOptions, generator: torch.Gen
 def population(modules: Sequence[TMLP], options: TMLPOptions) -> TMLPPopulation:
     """Stack built perceptrons."""
     return TMLPPopulation(modules, options)
-
-
-def memory(options: TMLPOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of the contracted weights of hidden layers, with the data to differentiate them."""
-    return 4 * agents * (options.depth - 1) * options.width**2 * copies * 3

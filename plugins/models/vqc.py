@@ -49,9 +49,6 @@ from qrlsuite.plugins.models import mlp
 from qrlsuite.plugins.models.mlp import initial_layer
 from qrlsuite.population import ACTIVATIONS, linear
 
-NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
-"""Bytes of circuit states that the two simulators keep at most, except that PennyLane takes at least one seed."""
-
 Activation = Literal["none", "relu", "tanh"]
 Readout = Literal["ansatz", "single", "pairs", "neighbors", "all-pairs", "product"]
 Linear = Literal[True, False, "behind"]
@@ -531,39 +528,6 @@ def population(modules: Sequence[VQC | mlp.MLP], options: VQCOptions) -> VQCPopu
     if isinstance(modules[0], mlp.MLP):
         return mlp.population(cast("Sequence[mlp.MLP]", modules), mlp.MLPOptions())
     return VQCPopulation(cast("Sequence[VQC]", modules), options)
-
-
-def memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of circuit states in memory; 0 if unknown."""
-    if options.backend == "native":
-        return _native_memory(options, agents, batch)
-    return _pennylane_memory(options, agents, batch) if options.backend == "pennylane" else 0
-
-
-def _native_memory(options: VQCOptions, agents: int, batch: int) -> int:
-    """Return the bytes of 2^n complex amplitudes, 8 each (16 in float64), of every sample, if they stay in memory.
-
-    Three of the simulator's working states, of 128 bytes per amplitude, come on top.
-    """
-    amplitudes = _amplitudes(options)
-    kept = agents * batch * amplitudes * (16 if options.dtype == "float64" else 8)
-    return 3 * 128 * amplitudes + (kept if kept <= NATIVE_STATES else 0)
-
-
-def _pennylane_memory(options: Any, agents: int, batch: int) -> int:
-    """Return the bytes of the states behind every gate, 64 layers n 2^n per sample, where PennyLane backpropagates."""
-    backprop = options.diff_method in ("auto", "backprop") and options.shots is None
-    if not (backprop and options.device == "default.qubit"):
-        return 0
-    lane: int = 64 * _amplitudes(options) * options.layers * options.qubits
-    return min(agents * batch * lane, max(batch * lane, PENNYLANE_STATES))
-
-
-def _amplitudes(options: VQCOptions) -> int:
-    """Return how many amplitudes the states of connected qubits have; 0 where none are connected."""
-    circuit = options._circuit
-    sizes = [] if circuit.mean_field else map(len, circuit.components())
-    return sum(1 << size for size in sizes if size > 1)
 
 
 def _backend_options(options: VQCOptions) -> dict[str, Any]:

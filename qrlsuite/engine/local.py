@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import IO
 
 from qrlsuite.engine.work import EngineOutcome, Show, Work, job_name, worker_command
@@ -23,7 +24,9 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.training.interrupts import Interruptible
 
 ATTEMPTS = 3
-"""Deaths of a group's worker, without a finished epoch between them, before the group is given up."""
+"""Deaths of a group's worker, with nothing gained between them, before the group is given up."""
+
+ALONE = "if memory is used up, not one seed fits: give fewer --workers, a smaller model, or a smaller replay buffer"
 
 IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
 """Signals with which a cluster warns its jobs. They reach every process; a worker saves when its supervisor says so."""
@@ -42,7 +45,8 @@ class WorkerJob:
     def __init__(self, work: Work, group: SeedGroup, works: Sequence[Work]) -> None:
         self.work, self.group, self.name = work, group, job_name(work, group, works)
         self.progress = ProgressFile(work.store, group.id)
-        self.deaths, self.epoch_at_death = 0, -1
+        self.deaths, self.gained = 0, (-1, 0, 0)
+        """Deaths since the last gain; finished seeds, their number at a time (negative) and the epoch at that time."""
         self.process: subprocess.Popen[bytes] | None = None
         self.output: IO[bytes] | None = None
 
@@ -77,13 +81,16 @@ class WorkerJob:
         text:
             Output of the process.
         """
-        epoch = int(self.progress.read().get("epoch") or 0)
-        self.deaths = 1 if epoch > self.epoch_at_death else self.deaths + 1
-        self.epoch_at_death = epoch
+        size = self.progress.size(len(self.group.seeds))
+        done = len(self.work.store.finished(self.group.seeds, self.work.epochs))
+        gained = done, -size, int(self.progress.read().get("epoch") or 0)
+        self.deaths = 1 if gained > self.gained else self.deaths + 1
+        self.gained = gained
         if self.deaths < ATTEMPTS:
             return None
         last = f": {text.splitlines()[-1]}" if text else ""
-        return f"its worker died {ATTEMPTS} times ({reason}){last}\n{text}"
+        alone = f"; {ALONE}" if size == 1 < len(self.group.seeds) else ""
+        return f"its worker died {ATTEMPTS} times ({reason}){alone}{last}\n{text}"
 
     def ended(self, code: int, outcome: EngineOutcome) -> bool:
         """Judge an ended worker; return whether to try again, else record its end in the outcome."""
@@ -120,6 +127,21 @@ def usable_cores() -> int:
     return os.cpu_count() or 1  # macOS
 
 
+def available_memory(meminfo: Path = Path("/proc/meminfo")) -> int | None:
+    """Return the bytes for new processes; the machine's whole memory if only that is known; None if unknown."""
+    try:
+        for line in meminfo.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name == "MemAvailable":
+                return int(value.split()[0]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # Windows has no sysconf
+        return None
+
+
 class LocalEngine:
     """Supervises worker processes on this machine."""
 
@@ -140,7 +162,7 @@ class LocalEngine:
         waiting = deque(jobs)
         outcome = EngineOutcome()
         for job in jobs:
-            job.progress.clear()
+            job.progress.clear(len(job.group.seeds))
         pause = 0.01  # grows until another job begins, so that a short run is seen to end at once
         try:
             with Interruptible() as guard:
@@ -148,7 +170,7 @@ class LocalEngine:
                     with (
                         guard.deferred()
                     ):  # a fork loses exceptions, and a process without a name is not stopped
-                        while waiting and len(self._running) < works[0].workers:
+                        while waiting and len(self._running) < works[0].workers and self._fits(jobs):
                             job = waiting.popleft()
                             self._running.append(job)
                             _start(job)
@@ -167,6 +189,17 @@ class LocalEngine:
             self.stop()
             raise
         return outcome
+
+    def _fits(self, jobs: Sequence[WorkerJob]) -> bool:
+        """Return whether one more group fits into memory, by the largest that was measured; the first always does."""
+        free = available_memory()
+        if not self._running or free is None:
+            return True
+        measured = {job.name: job.progress.read().get("memory") for job in jobs}
+        taken = {name: size if isinstance(size, int) else 0 for name, size in measured.items()}
+        largest = max(taken.values())
+        to_come = sum(largest - taken[job.name] for job in self._running)
+        return 0 < largest <= free - to_come
 
     def stop(self, patience: float = 60.0) -> None:
         """Ask every worker to save and end; after `patience` seconds, end them."""

@@ -29,7 +29,6 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import counted, duration_range
 from qrlsuite.statistics.curves import reached
 from qrlsuite.training import device as devices
-from qrlsuite.training import memory
 
 
 def find(
@@ -181,7 +180,6 @@ def train(
     display.deadline = None if limit is None else began + limit
     if not where.remote and work.groups:
         _check_device(where.device)
-        check_memory(work, where)
     fresh = not work.store.path.exists()
     EntryStore.create(work.runs, work.entry, work.store.mark)
     if work.groups:
@@ -222,13 +220,6 @@ def expected(work: Missing, where: Where) -> str | None:
         return None
     seconds = measured.range(work.left / min(where.workers, len(work.groups)))
     return f"it should take {duration_range(*seconds)} ({speed.MEASURED})"
-
-
-def check_memory(work: Missing, where: Where) -> None:
-    """Refuse groups that do not fit into this machine's memory; the memory of a GPU or a cluster is unknown."""
-    if where.device == "cpu" and not where.remote:
-        groups = [group.seeds for group in work.groups]
-        memory.require(work.entry, groups, where.workers, memory.available())
 
 
 def summarize(work: Missing) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from qrlsuite.notation import parse_named
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import device as devices
-from qrlsuite.training import memory
 
 
 @dataclass(frozen=True)
@@ -99,12 +98,9 @@ class Where:
             SeedGroup(tuple(seeds[i * len(seeds) // pieces : (i + 1) * len(seeds) // pieces]), 0)
             for i in range(pieces)
         ]
-        free = memory.available() if self.device == "cpu" else None
         parts = min(len(several), math.ceil(self.workers / pieces))
         while parts < len(several):
-            size = math.ceil(len(several) / parts) * math.ceil(len(seeds) / pieces)
-            needed = min(self.workers, parts * pieces) * memory.group_bytes(several[0].entry, size)
-            if size <= LARGEST_GROUP and (free is None or needed <= free):
+            if math.ceil(len(several) / parts) * math.ceil(len(seeds) / pieces) <= LARGEST_GROUP:
                 break
             parts += 1
         work = []

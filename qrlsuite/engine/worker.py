@@ -14,12 +14,15 @@ import atexit
 import contextlib
 import ctypes
 import gc
+import itertools
 import os
+import resource
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from qrlsuite.engine import probe as probing
 from qrlsuite.errors import QrlSuiteError, StoreError
@@ -27,8 +30,12 @@ from qrlsuite.results import codes, probes
 from qrlsuite.results.checkpoint import group_id
 from qrlsuite.results.claims import HEARTBEAT, HEARTBEAT_THREAD, Claim, SeedsClaimedError, acquire, living
 from qrlsuite.results.progress import Progress, ProgressFile
-from qrlsuite.results.seeds import parse_seeds, plan_groups
+from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
+from qrlsuite.results.text import counted
+
+if TYPE_CHECKING:
+    from qrlsuite.training.group import Part
 
 _PR_SET_PDEATHSIG = 1
 
@@ -72,7 +79,7 @@ def train_group(
     others:
         Folders of further entries whose seeds are trained in the same population.
     """
-    from qrlsuite.training.group import GroupRun, Part  # torch, which a supervisor does without
+    from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
 
     claims: list[Claim] = []
     heartbeat = ClaimHeartbeat(claims, parent)
@@ -82,6 +89,8 @@ def train_group(
     """Of each entry's seeds in the population."""
 
     def report(progress: Progress, error: str | None = None, force: bool = False) -> None:
+        if progress.done:
+            progress.memory = _most_memory()
         for path, file in files.items():
             file.write(progress, error, force, places.get(path, slice(0)))
 
@@ -102,17 +111,33 @@ def train_group(
             probes.require_independent(store)
             for group in plan_groups(store, seeds, epochs, workers=1):
                 parts.setdefault(group.epoch, []).append((store.entry(), store, group.seeds))
-        for _, together in sorted(parts.items()):
+        most = len(seeds) * max(1, len(files))
+        state.size, state.untried = min((file.size(most) for file in files.values()), default=most), True
+        report(state, force=True)
+        for together in [piece for _, whole in sorted(parts.items()) for piece in divided(whole, state.size)]:
             probe = probing.prepare(together, epochs, device)
             if probe is not None:
                 claims.append(probe.claim)
             run = GroupRun(together, epochs, device, report, held, probe)
+            run.progress.size, run.progress.untried = state.size, state.untried
+            if state.size < most:
+                run.progress.warnings.append(
+                    f"{counted(state.size, 'seed')} at a time instead of {most}: with more, the process was killed "
+                    "before an epoch ended, as happens where memory is used up; other entries of this size begin so "
+                    f"with --seeds {format_seeds(seeds[: state.size])}"
+                )
             places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress
             run.run()
-        state.phase, state.epoch = "finished", epochs
+            del run
+        state.phase, state.epoch, state.untried = "finished", epochs, False
         report(state, force=True)
+    except KeyboardInterrupt:
+        state.untried = False
+        report(state, force=True)
+        raise
     except QrlSuiteError as error:
+        state.untried = False
         if isinstance(error, probes.DependentSeedsError):
             _stop_others(claims)
         with contextlib.suppress(StoreError):  # on a full disk the message goes to stderr alone
@@ -124,6 +149,20 @@ def train_group(
             claim.release()
     if taken is not None:
         raise taken
+
+
+def divided(parts: Sequence[Part], size: int) -> Iterator[list[Part]]:
+    """Divide the seeds of entries at one epoch into groups of at most `size`."""
+    rest = [(place, seed) for place, (*_, seeds) in enumerate(parts) for seed in seeds]
+    for low in range(0, len(rest), size):
+        piece = itertools.groupby(rest[low : low + size], key=lambda each: each[0])
+        yield [(*parts[place][:2], [seed for _, seed in its]) for place, its in piece]
+
+
+def _most_memory() -> int:
+    """Return the most bytes that this process has had in memory."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
 
 
 def _stop_others(claims: Sequence[Claim]) -> None:

@@ -32,12 +32,19 @@ class Progress:
     """Whether numbers of each seed's agent are no longer finite after `epoch`."""
     epoch_seconds: float | None = None
     """Seconds of the last epoch; None for a process's first epoch, which includes its start."""
+    size: int = 0
+    """Seeds that are trained at a time, 0 before that is known."""
+    untried: bool = False
+    """Whether no epoch of so many seeds has ended here yet."""
+    memory: int = 0
+    """The most bytes that the process has had; 0 before its first round has ended."""
     warnings: list[str] = field(default_factory=list)
     """Warnings for the user although nothing failed: for example, a tracker was left out."""
 
     def finished_epoch(self, epoch: int, seed_scores: list[float], seed_diverged: list[bool]) -> None:
         """Take in that an epoch has finished, with every seed's score after it and whether it has diverged."""
         self.epoch, self.seed_scores, self.seed_diverged = epoch, seed_scores, seed_diverged
+        self.untried = False
         self.median_score = statistics.median(seed_scores)
 
 
@@ -90,12 +97,26 @@ class ProgressFile:
         """Return the last progress written, empty where there is none."""
         return read_progress(self.path)
 
-    def clear(self) -> None:
-        """Forget an earlier attempt's progress."""
+    def size(self, most: int) -> int:
+        """Return how many of at most so many seeds to train at a time.
+
+        They are as many as in the last attempt, and half as many if that was killed before one of its epochs ended, as
+        happens where memory is used up.
+        """
+        last = self.read()
+        size = last.get("size")
+        size = min(size, most) if isinstance(size, int) and size > 0 else most
+        return max(1, size // 2) if last.get("untried") else size
+
+    def clear(self, seeds: int) -> None:
+        """Forget an earlier attempt's progress, but for how many of the seeds to train at a time."""
+        size = self.size(seeds)
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             raise StoreError(f"cannot write {self.path}: {cause(error)}") from None
+        if size < seeds:
+            self.write(Progress(size=size), force=True)
 
 
 def read_progress(path: Path) -> dict[str, Any]:

@@ -13,12 +13,12 @@ from typing import Any
 
 from qrlsuite import options as option_values
 from qrlsuite import registry, specs
-from qrlsuite.errors import OptionError, PluginError
+from qrlsuite.errors import OptionError
 from qrlsuite.experiment.task import load as load_task
-from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
+from qrlsuite.testing.findings import Checklist, Finding, require
 from qrlsuite.testing.fresh import HEAVY, fresh_process
 
-REFERENCES = ("options", "build", "factory", "population", "vector", "entry_point", "memory")
+REFERENCES = ("options", "build", "factory", "population", "vector", "entry_point")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,8 +150,6 @@ def check_common(subject: Subject) -> tuple[list[Finding], bool]:
         usable = rules.run(
             "options", "defaults are valid, frozen, and survive being stored", lambda: _options(subject)
         )
-        if usable and "memory" in subject.references():
-            rules.run("memory", "says in whole bytes what it takes", lambda: _memory(subject))
     return rules.findings, usable
 
 
@@ -189,18 +187,6 @@ def _references(subject: Subject) -> None:
                 isinstance(target, type) and dataclasses.is_dataclass(target),
                 f"{field} = {reference!r} is not a dataclass: write a class under @pydantic.dataclasses.dataclass",
             )
-
-
-def _memory(subject: Subject) -> None:
-    from qrlsuite.training import memory
-
-    try:
-        if isinstance(subject.spec, specs.AlgorithmSpec):
-            memory.algorithm_memory(subject.spec, subject.options(), 10)
-        elif isinstance(subject.spec, specs.ModelSpec):
-            memory.model_bytes(subject.spec, subject.options(), 5, 64, memory.COPIES)
-    except PluginError as error:
-        raise BrokenRuleError(str(error)) from None
 
 
 def _is_options(field: str) -> bool:

@@ -123,7 +123,6 @@ def _run(
             for entry, (store, _) in zip(entries, places)
         ]
         for work, (_, code) in zip(works, places):
-            missing.check_memory(work, where)
             store = EntryStore.create(work.runs, work.entry, work.store.mark)
             codes.prepare(store, code, identity.plugins(work.entry))
             trained += len(work.todo)

@@ -216,9 +216,6 @@ def test_plans_are_divided_among_workers_and_into_memory(
     with monkeypatch.context() as patch:
         patch.setattr(where, "LARGEST_GROUP", 8)
         assert divided(1) == [(1, [4]), (2, [4])]
-    one = where.memory.group_bytes(entries(tiny_task)[0], 4)
-    monkeypatch.setattr(where.memory, "available", lambda: one)
-    assert divided(1) == [(1, [4])] * 3
 
 
 def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,6 +22,7 @@ from qrlsuite.options import build as build_options
 from qrlsuite.plugins.engines.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import _process_start, acquire
+from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
@@ -118,6 +121,52 @@ def test_the_time_between_checkpoints_is_checked(train: Train, monkeypatch: pyte
 def test_local_workers_are_as_many_as_cores_or_as_asked() -> None:
     assert LocalEngine().workers(None) == len(os.sched_getaffinity(0))
     assert LocalEngine().workers(7) == 7
+
+
+@pytest.mark.parametrize(("free", "most"), [(0, 1), (1 << 50, 2)])
+def test_a_group_begins_where_it_fits_beside_the_first(
+    free: int, most: int, train: Train, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It needs what the first one has had in memory after its first rounds."""
+    monkeypatch.setattr(local, "available_memory", lambda: free)
+    store, engine, seen = EntryStore(train("runs", [9], 1)), LocalEngine(), list[tuple[int, bool]]()
+
+    def show(snapshot: api.Snapshot) -> None:
+        seen.append((len(engine._running), any(state.get("memory") for state in snapshot.values())))
+        if sum(measured for _, measured in seen) > 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        engine.run([api.Work(store, [SeedGroup((0, 1), 0), SeedGroup((2, 3), 0)], 1_000_000, 2)], show)
+    assert {running for running, measured in seen if not measured} == {1}
+    assert max(running for running, _ in seen) == most
+
+
+def test_half_as_many_are_trained_at_a_time_after_a_kill_in_the_first_epoch(tmp_path: Path) -> None:
+    file, state = ProgressFile(EntryStore(tmp_path), "g"), Progress(size=10, untried=True)
+    assert file.size(10) == 10
+    file.write(state, force=True)
+    assert file.size(10) == 5
+    for _ in range(2):
+        file.clear(10)
+        assert file.size(10) == 5, "another command knows it"
+    assert file.size(3) == 3
+    state.finished_epoch(1, [0.5], [False])
+    file.write(state, force=True)
+    assert file.size(10) == 10, "later deaths have other causes"
+    for damaged in ("x", -1, None):
+        file.path.write_text(json.dumps({"size": damaged, "untried": True}))
+        assert file.size(10) == 5
+
+
+def test_seeds_of_several_entries_are_divided() -> None:
+    parts: Any = [("a", "in a", (0, 1, 2)), ("b", "in b", (0, 1))]
+    assert list(worker.divided(parts, 5)) == [[("a", "in a", [0, 1, 2]), ("b", "in b", [0, 1])]]
+    assert list(worker.divided(parts, 2)) == [
+        [("a", "in a", [0, 1])],
+        [("a", "in a", [2]), ("b", "in b", [0])],
+        [("b", "in b", [1])],
+    ]
 
 
 def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(train: Train) -> None:

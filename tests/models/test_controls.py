@@ -22,7 +22,6 @@ from qrlsuite.plugins.circuits.ansatz import NoOptions
 from qrlsuite.plugins.models.tmlp import contracted
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import AnsatzSpec
-from qrlsuite.training import memory
 from qrlsuite.training.trainer import Trainer
 from qrlsuite.tuning.space import declared
 from tests.conftest import Train, results
@@ -269,18 +268,3 @@ def test_circuits_without_that_parameter(
 def test_options_of_fourier_and_tmlp(words: tuple[str, ...], message: str) -> None:
     with pytest.raises(OptionError, match=message):
         entry("tmlp" if words[0].startswith("width") else "fourier", *words)
-
-
-def test_more_features_than_memory_are_refused() -> None:
-    """Two features each and two products of each, 64 samples of 4 bytes: 100 MB for 65,536 frequencies."""
-    large = entry("fourier", "frequencies=65536")
-    small = entry("fourier", "frequencies=1")
-    assert memory.group_bytes(large, 1) - memory.group_bytes(small, 1) == 65_535 * 64 * 4 * 6
-    with pytest.raises(OptionError, match=r"training 100 seeds at a time takes .* first --seeds 0:"):
-        memory.require(large, [range(100)], 1, 8 * 10**9)
-    with pytest.raises(
-        OptionError, match=r"not even one seed fits: make the model smaller .`qrlsuite show model fourier`"
-    ):
-        memory.require(large, [range(1)], 1, 400 * 10**6)
-    free = entry("vqc-native", "qubits=20", "entangled=mean-field"), entry("mlp", "width=1", "depth=1")
-    assert memory.group_bytes(free[0], 5) == memory.group_bytes(free[1], 5), "no state of 2^20 amplitudes"

@@ -384,12 +384,3 @@ def test_values_are_repeated_and_outputs_scaled(linear):
         assert torch.equal(together(x)[s], module(x[s]))
     faster = agents(1, small("native", output_rate=10.0, output_scale=2.0))[0].learning_rates()
     assert faster == dict.fromkeys(("output.weight", "output.bias", "output.factor"), 10.0)
-
-
-def test_memory_is_counted_where_qubits_have_a_common_state():
-    def counted(**values):
-        return vqc.memory(small("native", qubits=4, **values), 1, 8, 1)
-
-    assert counted(ansatz="hsiao") == 0, "its qubits are apart"
-    assert counted(ansatz="hsiao", readout="product") == counted(ansatz="iqp") > 0
-    assert counted(ansatz="cz", ansatz_options={"entangled": "mean-field"}) == 0

@@ -14,10 +14,6 @@ def build(*given: Any) -> None:
     raise AssertionError("no rule that all kinds share builds anything")
 
 
-def memory(*given: Any) -> int:
-    return 1000
-
-
 NUMBER = 3
 
 

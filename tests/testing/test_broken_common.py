@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from qrlsuite import registry
-from qrlsuite.specs import AlgorithmSpec, EngineSpec, EnvironmentSpec, ModelSpec, PictureSpec, Spec
+from qrlsuite.specs import EngineSpec, EnvironmentSpec, ModelSpec, PictureSpec, Spec
 from qrlsuite.testing import common
 from qrlsuite.testing.common import check_common, subject
 from qrlsuite.testing.fresh import fresh_process
@@ -32,7 +32,6 @@ def register_models(register):
         ModelSpec(
             name="{name}", summary="Strange", family="classical",
             options="tests.testing.strange:Good", build="tests.testing.strange:build",
-            memory="tests.testing.strange:memory",
         )
     )
 """
@@ -78,16 +77,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     importlib.invalidate_caches()
 
 
-def model(
-    options: str = "Good", build: str = f"{STRANGE}:build", name: str = "", memory: str = f"{STRANGE}:memory"
-) -> ModelSpec:
+def model(options: str = "Good", build: str = f"{STRANGE}:build", name: str = "") -> ModelSpec:
     return ModelSpec(
         name=name or re.sub(r"\W+", "-", f"{options} {build}".lower()),
         summary="Strange",
         family="classical",
         options=f"{STRANGE}:{options}",
         build=build,
-        memory=memory,
     )
 
 
@@ -149,10 +145,6 @@ EDITS = [
          subject=model("Doubling")),
     edit("options", r"^option 'names' holds a set, whose order is another one in every", subject=model("Unordered")),
     edit("options", r"^option 'width' can be assigned to: write @dataclass\(frozen=True\)", subject=model("Assigned")),
-    edit("memory", r":build' fails: AssertionError: no rule that all", subject=model(memory=f"{STRANGE}:build")),
-    edit("memory", r"Good' fails: .*", subject=model(memory=f"{STRANGE}:Good")),
-    edit("memory", r"^'learner': memory = '.*:memory' returned 1000, and must return a Memory of whole numbers",
-         subject=AlgorithmSpec("learner", "Strange", f"{STRANGE}:Good", f"{STRANGE}:build", f"{STRANGE}:memory")),
 ]  # fmt: skip
 
 

@@ -46,29 +46,16 @@ WHERE_OFFERED = {
     ("circuit_backends", "native"): ["mean field", "shots"],
     ("circuit_backends", "pennylane"): ["shots"],
     ("circuit_backends", "qiskit"): ["shots"],
-    **{
-        ("models", name): ["memory"]
-        for name in (
-            "fourier",
-            "gru",
-            "lstm",
-            "mlp",
-            "tmlp",
-            *(f"{m}-{b}" for m in ("vqc", "qlstm", "qfwp") for b in BACKENDS),
-        )
-    },
-    ("algorithms", "td3"): ["memory"],
-    **{("algorithms", name): ["memory", "masks"] for name in ("ddqn", "reinforce")},
-    ("algorithms", "drqn"): ["memory", "memory of episodes", "masks"],
+    **{("algorithms", name): ["masks"] for name in ("ddqn", "reinforce")},
+    ("algorithms", "drqn"): ["memory of episodes", "masks"],
     ("algorithms", "ppo"): [
-        "memory",
         "masks",
         "box actions",
         "multi-discrete actions",
         "multi-binary actions",
         "memory of episodes",
     ],
-    ("algorithms", "sac"): ["memory", "masks", "discrete actions"],
+    ("algorithms", "sac"): ["masks", "discrete actions"],
 }
 """Rules about what a thing need not have."""
 
