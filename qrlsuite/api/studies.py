@@ -289,7 +289,7 @@ def train_studies(
     console = Console(stderr=True, quiet=not progress, highlight=False, soft_wrap=True, markup=False)
     missing.check_budget(budget, where)
     works, began = [work for each in every for work in each.works], time.monotonic()
-    missing.places(works[0].runs, [work.entry for work in works], where, quiet=not progress)
+    missing.settle_codes(works[0].runs, [work.entry for work in works], where, quiet=not progress)
     for each in every:
         if len(every) > 1:
             console.print(f"\nstudy {each.study.name}: {each.study.summary}")

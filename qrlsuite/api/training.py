@@ -179,16 +179,16 @@ def train_entry(
 
         entry, put_agents = begin_with(entry, folder, start, seed_numbers)
     missing.check_budget(budget, where)
-    [(store, code)] = missing.places(folder, [entry], where, quiet)
+    missing.settle_codes(folder, [entry], where, quiet)
+    work = missing.find(folder, entry, where, seed_numbers, epochs)
     if put_agents is not None:
-        put_agents(store)
-    work = missing.find(folder, entry, where, seed_numbers, epochs, store)
+        put_agents(work.store)
     if work.groups:
         missing.require_trainable([entry], where)
     display = RunDisplay(work, where.workers, quiet)
     display.expected = None if quiet else missing.expected(work, where)
     with trackers.asking([track] if isinstance(track, str) else list(track)):
-        submitted = missing.train(work, where, display, budget, confirmed, code).submitted
+        submitted = missing.train(work, where, display, budget, confirmed).submitted
     if submitted is None and not quiet and display.again == "command":
         at_work = [group for group in groups(work.store) if group.state in ("running", "submitted")]
         display.finished(missing.summarize(work), [group for group in at_work if {*group.seeds} & work.busy])

@@ -20,7 +20,6 @@ from qrlsuite.engine.work import EngineOutcome, Missing, Snapshot, raise_failure
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import checkpoint, codes, probes, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
@@ -37,7 +36,6 @@ def find(
     where: Where,
     seeds: Sequence[int] | None = None,
     epochs: int | None = None,
-    store: EntryStore | None = None,
 ) -> Missing:
     """Find an entry's missing seeds in a results folder; writes nothing.
 
@@ -45,33 +43,29 @@ def find(
     ----------
     seeds, epochs:
         None takes the task's protocol.
-    store:
-        The entry's folder, where `places` has just returned it.
     """
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
-    store = store or codes.place(runs, entry, identity.of(entry))
+    code = identity.of(entry)
+    store = codes.place(runs, entry, code)
     busy = {seed for claim in certain(store) for seed in claim.seeds} | where.engine.queued(store)
     busy &= set(requested)
     left = sorted(set(requested) - busy)
     missing = plan_groups(store, left, last, where.workers)
-    return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
+    return Missing(runs, entry, store, requested, last, frozenset(busy), missing, code)
 
 
-def places(
-    runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False
-) -> list[tuple[EntryStore, CodeIdentity]]:
-    """Return the folder and the code of each entry, before anything is planned.
+def settle_codes(runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False) -> None:
+    """Say of which entries earlier seeds are of another code, unless `quiet`, before anything is planned.
 
-    Where earlier seeds are of another code, one line says so unless `quiet`; the seeds of a study with looks are
-    refused then. With `where.same` they are continued: the codes are linked, once a checkpoint was loaded.
+    A study with looks is refused then. With `where.same`, the codes are linked, once a checkpoint was loaded.
     """
     reason = where.same
     if reason is not None and (not reason.strip() or not reason.isprintable()):
         raise OptionError(
             "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
         )
-    found, anew = [], list[str]()
+    anew = []
     for entry in entries:
         code = identity.of(entry)
         store = codes.place(runs, entry, code)
@@ -79,7 +73,6 @@ def places(
         if before is not None and reason is not None:
             _require_loadable(entry, before)
             codes.link(before, code, reason)
-            store = codes.place(runs, entry, code)
         elif before is not None and codes.of(store) is None:
             seeds = f"{before.path} has seeds {format_seeds(before.seeds())} of another code"
             if entry.study is not None:
@@ -91,12 +84,17 @@ def places(
                 f"{seeds}: {codes.change(before, code)}. Begun anew is '{entry.label} {store.mark}'; --same \"REASON\" "
                 "continues the old seeds, if nothing changed in effect"
             )
-        found.append((store, code))
     if anew:
         more = f" (and so for {counted(len(anew) - 1, 'more entry')})" if len(anew) > 1 else ""
         console = Console(stderr=True, quiet=quiet, highlight=False)
         console.print(f"{anew[0]}{more}", markup=False, soft_wrap=True)
-    return found
+
+
+def prepare(work: Missing) -> None:
+    """Create the entry's folder, if need be, and write down with which code its missing seeds are trained."""
+    EntryStore.create(work.runs, work.entry, work.store.mark)
+    if work.groups:
+        codes.prepare(work.store, work.code or identity.of(work.entry), identity.plugins(work.entry))
 
 
 def _require_loadable(entry: Entry, store: EntryStore) -> None:
@@ -150,7 +148,6 @@ def train(
     display: RunDisplay,
     budget: str | None = None,
     confirmed: bool = True,
-    code: CodeIdentity | None = None,
     began: float | None = None,
 ) -> EngineOutcome:
     """Train the planned groups, showing progress; return how it ended.
@@ -161,8 +158,6 @@ def train(
         After which training stops, with every finished epoch saved. None for no limit.
     confirmed:
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
-    code:
-        The entry's, where `places` has just returned it.
     began:
         When the budget began, by `time.monotonic`; None is now.
     """
@@ -181,9 +176,7 @@ def train(
     if not where.remote and work.groups:
         _check_device(where.device)
     fresh = not work.store.path.exists()
-    EntryStore.create(work.runs, work.entry, work.store.mark)
-    if work.groups:
-        codes.prepare(work.store, code or identity.of(work.entry), identity.plugins(work.entry))
+    prepare(work)
     holders = sorted({f"process {claim.pid} on {claim.host}" for claim in certain(work.store)})
     display.begin(where.submits, holders)
     if not work.groups:

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results.seeds import SeedGroup, format_seeds
 from qrlsuite.results.store import EntryStore
 
@@ -37,6 +38,8 @@ class Missing:
         Seeds that another process trains, or that wait in a queue.
     groups:
         The other missing seeds, in groups.
+    code:
+        The code that trains them.
     """
 
     runs: Path
@@ -46,6 +49,7 @@ class Missing:
     epochs: int
     busy: frozenset[int] = frozenset()
     groups: Sequence[SeedGroup] = field(default_factory=list)
+    code: CodeIdentity | None = None
 
     @property
     def todo(self) -> list[int]:

@@ -621,8 +621,11 @@ class EntryStore:
     @property
     def trained(self) -> str:
         """When the newest epoch of its seeds ended, in UTC; empty if not recorded."""
-        seeds = self.seeds() if self.path.is_dir() else ()
-        return max((line.time for seed in seeds for line in self.seed(seed).times()[-1:]), default="")
+        times = [""]
+        for seed in self.seeds() if self.path.is_dir() else ():
+            with contextlib.suppress(StoreError):  # is said where the seed is read
+                times += [line.time for line in self.seed(seed).times()[-1:]]
+        return max(times)
 
     @classmethod
     def find(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:

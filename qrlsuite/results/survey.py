@@ -355,27 +355,6 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
     queued:
         As for `look`.
     """
-    require_movable(runs, store, queued)
-    path = store.path
-    size, _ = _usage(path)
-    gone = path.with_name(f".deleted-{path.name}-{secrets.token_hex(4)}")
-    move_away(store, gone)
-    try:
-        (gone / "entry.json").unlink()  # so that what is left, if this is interrupted, is no entry
-        shutil.rmtree(gone)
-    except OSError as error:
-        raise StoreError(f"cannot remove {gone}: {error.strerror or error}") from None
-    return size
-
-
-def require_movable(runs: Path, store: EntryStore, queued: Collection[int] | None = None) -> None:
-    """Refuse to move an entry's folder if it is or lies beyond a link, or if a queue has seeds of it.
-
-    Parameters
-    ----------
-    runs, queued:
-        As for `delete`.
-    """
     path = store.path
     if path.is_symlink() or path.parent.is_symlink() or path.resolve().parents[1] != runs.resolve():
         raise StoreError(
@@ -386,3 +365,12 @@ def require_movable(runs: Path, store: EntryStore, queued: Collection[int] | Non
         raise StoreError(
             f"{path} waits in a queue ({waits[0].where}): cancel that first; nothing was deleted"
         )
+    size, _ = _usage(path)
+    gone = path.with_name(f".deleted-{path.name}-{secrets.token_hex(4)}")
+    move_away(store, gone)
+    try:
+        (gone / "entry.json").unlink()  # so that what is left, if this is interrupted, is no entry
+        shutil.rmtree(gone)
+    except OSError as error:
+        raise StoreError(f"cannot remove {gone}: {error.strerror or error}") from None
+    return size

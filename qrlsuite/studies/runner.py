@@ -15,7 +15,7 @@ from rich.text import Text
 from qrlsuite import registry, specs
 from qrlsuite.engine.budget import seconds
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.missing import find, places, require_trainable, train
+from qrlsuite.engine.missing import find, require_trainable, settle_codes, train
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
@@ -265,7 +265,7 @@ def take_looks(study: Study, where: Where, budget: str | None, quiet: bool) -> S
 
     Unless it is quiet, it prints the verdicts of every look.
     """
-    places(study.folder, list(study.entries.values()), where, quiet)
+    settle_codes(study.folder, list(study.entries.values()), where, quiet)
     study.begin()
     state, began, submitted = study.look(), time.monotonic(), tuple[str, ...]()
     while wanted := state.decision.wanted:

@@ -11,9 +11,8 @@ from qrlsuite.engine import missing
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import raise_failures
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.experiment import identity, preset
+from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning.bayesian import Bayesian
 from qrlsuite.tuning.display import TuneDisplay
@@ -116,15 +115,11 @@ def _run(
 
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
-        places = missing.places(runs / FOLDER, entries, where, display.console.quiet)
+        missing.settle_codes(runs / FOLDER, entries, where, display.console.quiet)
         missing.require_trainable(entries, where)
-        works = [
-            missing.find(runs / FOLDER, entry, where, seeds, epochs, store)
-            for entry, (store, _) in zip(entries, places)
-        ]
-        for work, (_, code) in zip(works, places):
-            store = EntryStore.create(work.runs, work.entry, work.store.mark)
-            codes.prepare(store, code, identity.plugins(work.entry))
+        works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
+        for work in works:
+            missing.prepare(work)
             trained += len(work.todo)
         display.begin_trials(works)
         for together in where.divide(works):

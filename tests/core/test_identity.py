@@ -442,6 +442,8 @@ def test_a_board_shows_the_newest_code_with_enough_seeds(tmp_path: Path) -> None
         seed = EntryStore(tmp_path / day).seed(0)
         seed.path.mkdir(parents=True)
         seed.timings.write_text(json.dumps({"time": f"2026-01-0{day}"}) + "\n")
+    shutil.copytree(tmp_path / "1" / "seed-0000", tmp_path / "1" / "seed-0001")
+    (tmp_path / "1" / "seed-0001" / "timings.jsonl").write_text("damaged\n")
     newer = replace(boards.changed(boards.entry("mlp", 19), code=second), folder=tmp_path / "2")
     for seeds, expected in ((19, [newer]), (20, None)):
         older = replace(boards.changed(boards.entry("mlp", seeds), code=first), folder=tmp_path / "1")
