@@ -13,7 +13,7 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.results import lookup
 from qrlsuite.results.store import entries
 from tests.commands import say
-from tests.conftest import TINY, Train, cases
+from tests.conftest import TINY, cases, trainer
 
 
 class Entry(NamedTuple):
@@ -118,15 +118,17 @@ def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:
         lookup.choose([found], "x", tmp_path)
 
 
-@pytest.fixture
-def two_tasks(tiny_task: str, train: Train, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def two_tasks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of two tasks with entries of the same labels."""
+    root = tmp_path_factory.mktemp("two")
     for name in ("tiny", "other"):
-        changed = TINY.replace('"tiny"', f'"{name}"').replace("degree = 3", f"degree = {len(name)}")
-        Path(tiny_task).write_text(changed)
+        (root / "tiny.toml").write_text(
+            TINY.replace('"tiny"', f'"{name}"').replace("degree = 3", f"degree = {len(name)}")
+        )
         for width in (8, 16):
-            train("runs", [0, 1], 1, settings=(f"width={width}",))
-    return tmp_path / "runs"
+            trainer(str(root / "tiny.toml"), root)("runs", [0, 1], 1, settings=(f"width={width}",))
+    return root
 
 
 @pytest.mark.parametrize(
@@ -139,9 +141,9 @@ def two_tasks(tiny_task: str, train: Train, tmp_path: Path) -> Path:
     ],
 )
 def test_a_task_narrows_the_search(
-    words: tuple[str, ...], two_tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], two_tasks: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(two_tasks)
     with pytest.raises(
         UnknownNameError, match="may be any of 'other/ddqn mlp width=8', 'tiny/ddqn mlp width=8'"
     ):

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from qrlsuite.seeding import Streams, pack, unpack
 
+KEYS = st.tuples(st.text(), st.integers(0, 10**9), st.text(), st.integers(0, 10**9))
 
-def test_same_key_same_numbers_other_key_others() -> None:
-    def draw(*key: object) -> float:
-        task, seed, name, index = key
-        return float(Streams(str(task), int(str(seed))).numpy(str(name), int(str(index))).random())
 
-    base = draw("t", 1, "replay", 0)
-    assert draw("t", 1, "replay", 0) == base
-    others = [
-        draw("u", 1, "replay", 0),
-        draw("t", 2, "replay", 0),
-        draw("t", 1, "init", 0),
-        draw("t", 1, "replay", 1),
-    ]
-    assert len({base, *others}) == 5
+@given(KEYS, KEYS)
+def test_same_key_same_numbers_other_key_others(one: tuple[Any, ...], other: tuple[Any, ...]) -> None:
+    first = [Streams(task, seed).numpy(name, index).random() for task, seed, name, index in (one, one, other)]
+    assert first[0] == first[1]
+    assert (first[0] == first[2]) == (one == other)
 
 
 def test_the_numbers_never_change() -> None:

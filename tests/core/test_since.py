@@ -16,7 +16,6 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options, registry, specs
-from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import Since
@@ -25,8 +24,6 @@ from qrlsuite.plugins.circuits import ansatz
 from qrlsuite.plugins.environments.beam6g import options as beam6g
 from qrlsuite.plugins.models import mlp, vqc
 from qrlsuite.results.records import EntryRecord
-from qrlsuite.results.store import EntryStore
-from tests.conftest import Train, results
 
 FROZEN = ConfigDict(extra="forbid")
 
@@ -163,15 +160,6 @@ def test_a_preset_that_sets_one_shows_in_the_label_of_those_who_use_it(
     Path(tiny_task).write_text(text.replace('"ddqn"\n', '"ddqn"\ndefault_preset = "new"\n', 1))
     assert resolve(tiny_task, "mlp").label == f"{before.label} warm_up=9"
     assert facts(resolve(tiny_task, "mlp", settings=words("warm_up=0")))[:3] == facts(before)[:3]
-
-
-def test_a_run_from_before_is_resumed(train: Train, upgrade: Callable[[], None]) -> None:
-    straight = train("straight", [0, 1], 4, settings=("width=8",))
-    begun = train("begun", [0, 1], 2, settings=("width=8",))
-    upgrade()
-    train_group(begun, [0, 1], 4)
-    assert [results(begun, seed) for seed in (0, 1)] == [results(straight, seed) for seed in (0, 1)]
-    assert EntryStore(begun).record() == EntryStore(straight).record()
 
 
 def test_it_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:

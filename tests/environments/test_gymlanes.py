@@ -57,34 +57,6 @@ def test_every_lane_is_the_single_environment(env_id: str) -> None:
     env.close()
 
 
-def test_a_time_limit_truncates_and_an_end_terminates() -> None:
-    cut, ended = lanes(f"{HERE}:Cut-v0", 2), lanes(WALK, 2)
-    for env in (cut, ended):
-        env.reset()
-    for step in range(1, 9):
-        _, _, terminated, truncated, _ = cut.step(np.zeros(2, dtype=np.int64))
-        assert not terminated.any()
-        assert truncated.tolist() == [step % 4 == 0] * 2
-    flags = [ended.step(np.zeros(2, dtype=np.int64))[2:4] for _ in range(20)]
-    assert sum(terminated.sum() for terminated, _ in flags) > 2
-    assert not any(truncated.any() for _, truncated in flags)
-
-
-def test_scores_come_from_info_where_there_are_any() -> None:
-    for scored in (True, False):
-        env = lanes(WALK, 4, scored=scored)
-        env.reset()
-        for _ in range(15):
-            steps = env.state_dict()["actions"] >= 0
-            _, _, terminated, _, infos = env.step(np.zeros(4, dtype=np.int64))
-            if terminated.any() and scored:
-                np.testing.assert_array_equal(infos["final_info"]["_score"], terminated)
-                expected = (steps.sum(axis=1) + 1) / 12
-                np.testing.assert_allclose(infos["final_info"]["score"][terminated], expected[terminated])
-            elif terminated.any():
-                assert infos["final_info"] == {}
-
-
 @pytest.mark.parametrize(
     ("kind", "size", "first"),
     [
