@@ -12,9 +12,9 @@ from tests.commands import qrlsuite, say
 from tests.conftest import Train
 
 
-def test_table_json_and_picture(train: Train, tmp_path: Path) -> None:
-    folder = train("runs", [0, 1, 2], 1)
-    train("runs", [0, 1], 1, settings=("width=8",))
+def test_table_json_and_picture(kept: Train, tmp_path: Path) -> None:
+    folder = kept("runs", [0, 1, 2], 1)
+    kept("runs", [0, 1], 1, settings=("width=8",))
     picture = tmp_path / "h.svg"
     words = ["evaluate", str(folder), "mlp width=8", "--best", "2", "--episodes", "30"]
     words += ["--runs", str(tmp_path / "runs")]
@@ -49,8 +49,8 @@ def test_a_tasks_reference_policies_play_without_entries(tmp_path: Path) -> None
             say(*words, *more)
 
 
-def test_what_cannot_be_played_is_refused(train: Train, tmp_path: Path) -> None:
-    folder = train("runs", [0], 1)
+def test_what_cannot_be_played_is_refused(kept: Train, tmp_path: Path) -> None:
+    folder = kept("runs", [0], 1)
     (folder / "seed-0000" / "final.safetensors").unlink()
 
     def refused(message: str, *words: str) -> None:

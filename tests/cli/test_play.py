@@ -90,8 +90,8 @@ def counting(tmp_path: Path, kind: str = "image") -> Path:
     return trainer(str(tmp_path / "counter.toml"), tmp_path)("runs", [0, 1], 1, "mlp", ("width=4",))
 
 
-def test_the_episode_is_the_one_that_evaluate_plays(train: Train, tmp_path: Path) -> None:
-    store = EntryStore(train("runs", [0, 1, 2], 2))
+def test_the_episode_is_the_one_that_evaluate_plays(kept: Train, tmp_path: Path) -> None:
+    store = EntryStore(kept("runs", [0, 1, 2], 2))
     shown = api.play(str(store.path), episode=3, runs=tmp_path / "runs")
     played = evaluation.trained(store, 1, 5)
     assert (shown.seed, shown.runs) == (played.seeds[0], 3)
@@ -110,8 +110,8 @@ def test_the_episode_is_the_one_that_evaluate_plays(train: Train, tmp_path: Path
     assert 'src="data:image/gif;base64,R0lGOD' in shown._repr_html_()
 
 
-def test_an_agent_acts_in_a_loop_of_ones_own(train: Train, tmp_path: Path) -> None:
-    store = EntryStore(train("runs", [0, 1, 2], 2))
+def test_an_agent_acts_in_a_loop_of_ones_own(kept: Train, tmp_path: Path) -> None:
+    store = EntryStore(kept("runs", [0, 1, 2], 2))
     shown = api.play(str(store.path), episode=3, runs=tmp_path / "runs")
     agent = api.agent(str(store.path), runs=tmp_path / "runs")
     assert (agent.seed, agent.runs, agent.task) == (shown.seed, 3, "tiny")
@@ -149,8 +149,8 @@ def test_an_agent_acts_in_a_loop_of_ones_own(train: Train, tmp_path: Path) -> No
             api.agent(str(store.path), seed=bad, runs=tmp_path / "runs")
 
 
-def test_an_agent_that_remembers_is_told_where_episodes_begin(train: Train, tmp_path: Path) -> None:
-    store = EntryStore(train("runs", [0], 1, "ppo gru", ("width=2",)))
+def test_an_agent_that_remembers_is_told_where_episodes_begin(kept: Train, tmp_path: Path) -> None:
+    store = EntryStore(kept("runs", [0], 1, "ppo gru", ("width=2",)))
     agent = api.agent(str(store.path), runs=tmp_path / "runs")
     observations, infos = agent.environments(2).reset(seed=0)
     with pytest.raises(OptionError, match=r"'ppo' remembers episodes: give act\(\) where they begin"):
@@ -234,7 +234,7 @@ def test_environments_that_draw_nothing_say_so(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_single_form_that_plays_something_else_is_not_shown(
-    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kept: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = BeamManagement6G.step
 
@@ -244,11 +244,11 @@ def test_a_single_form_that_plays_something_else_is_not_shown(
 
     monkeypatch.setattr(BeamManagement6G, "step", more)
     with pytest.raises(EnvironmentFailure, match="its single form earns"):
-        api.play(str(train("runs", [0], 1)), runs=tmp_path / "runs")
+        api.play(str(kept("runs", [0], 1)), runs=tmp_path / "runs")
 
 
-def test_wrong_input(train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = train("runs", [0], 1)
+def test_wrong_input(kept: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = kept("runs", [0], 1)
     monkeypatch.setenv("PATH", str(tmp_path))
     for words, message in (
         (["mlp", "--out", "x.txt"], r"the file's ending must be \.gif or \.mp4"),

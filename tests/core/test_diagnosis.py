@@ -64,8 +64,8 @@ def at_80_columns(found: object) -> str:
     return text.getvalue()
 
 
-def test_trained_agents_beside_their_initial_parameters(train: Train, tmp_path: Path) -> None:
-    folder = train("runs", [0, 1], 2, model="vqc-native", settings=SMALL)
+def test_trained_agents_beside_their_initial_parameters(kept: Train, tmp_path: Path) -> None:
+    folder = kept("runs", [0, 1], 2, model="vqc-native", settings=SMALL)
     found = along_episodes(EntryStore(folder), episodes=3)
     assert (found.qubits, set(found.seeds), found.outputs) == (2, {0, 1}, "values")
     assert found.steps.tolist() == list(range(20))
@@ -80,7 +80,7 @@ def test_trained_agents_beside_their_initial_parameters(train: Train, tmp_path: 
         assert found.powers[which].shape[0] == 2
     for by_parameters in (found.information, found.powers, found.entanglement):
         assert str(by_parameters["trained"]) != str(by_parameters["initial"])
-    network = train("runs", [0], 1, settings=("width=3",))
+    network = kept("runs", [0], 1, settings=("width=3",))
     picture = tmp_path / "e.svg"
     words = ("diagnose", folder, network, "--episodes", 2)
     text = qrlsuite(*words, "--out", picture)
@@ -94,9 +94,9 @@ def test_trained_agents_beside_their_initial_parameters(train: Train, tmp_path: 
     assert classical["trained"]["effective_dimension"][0] > 0
 
 
-def test_gauge_directions_of_a_policy_hold_what_is_added_to_all_logits(train: Train) -> None:
+def test_gauge_directions_of_a_policy_hold_what_is_added_to_all_logits(kept: Train) -> None:
     """The biases of 3 logits have 2 directions. A circuit that was trained with shots is taken exactly."""
-    folder = train("runs", [0], 1, model="reinforce vqc-native", settings=(*SMALL, "shots=10"))
+    folder = kept("runs", [0], 1, model="reinforce vqc-native", settings=(*SMALL, "shots=10"))
     found = along_episodes(EntryStore(folder), episodes=2)
     assert found.outputs == "policy"
     gauge = found.gauge("trained")
@@ -115,12 +115,12 @@ def test_steps_after_an_episode_s_end_do_not_count(tiny_task: str, train: Train)
     assert (np.diff(ended.astype(int), axis=1) >= 0).all()
 
 
-def test_what_has_no_states_has_no_entanglement(train: Train) -> None:
-    mean_field = train("runs", [0], 1, model="vqc-native", settings=(*SMALL, "entangled=mean-field"))
+def test_what_has_no_states_has_no_entanglement(kept: Train) -> None:
+    mean_field = kept("runs", [0], 1, model="vqc-native", settings=(*SMALL, "entangled=mean-field"))
     found = along_episodes(EntryStore(mean_field), episodes=1)
     assert not found.entanglement
     assert found.information["trained"][0].rank > 0
-    apart = train("runs", [0], 1, model="vqc-native", settings=(*SMALL, "entangled=separable"))
+    apart = kept("runs", [0], 1, model="vqc-native", settings=(*SMALL, "entangled=separable"))
     for values in along_episodes(EntryStore(apart), episodes=1).entanglement["trained"].values():
         assert np.abs(values).max() < 1e-5
 
