@@ -465,6 +465,10 @@ def test_the_module_beside_a_file_is_meant_where_python_has_another(monkeypatch:
         ),
         ("stranger.py", "x = 1\n", False),
         ("parts/README.md", "read", False),
+        ("parts/tests/test_more.py", "x = 1\n", False),
+        ("parts/__pycache__/more.pyc", "x", False),
+        ("parts/.notes", "x", False),
+        ("parts/notes.txt", "imported?", True),
     ],
 )
 def test_the_identity_covers_what_belongs_to_a_file(path: str, text: str, counts: bool) -> None:
