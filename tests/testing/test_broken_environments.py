@@ -1,12 +1,14 @@
-"""Environments that break one rule each: edits of a good one, and of one in lanes."""
+"""Environments that break one rule each: edits of the one of `acme-qrl`, and of one in lanes."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from qrlsuite.specs import EnvironmentSpec
 from qrlsuite.testing import check
-from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, good, ids, module
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module
 
 LANES = '''
 from gymnasium.spaces import Box, Discrete
@@ -70,7 +72,8 @@ def nothing(options, num_envs):
 def always_ten(options, num_envs):
     return Lanes(options, 10)
 '''
-GOOD = good("environment").replace("] = 20", "] = 6") + LANES
+ACME = Path(__file__).parents[1] / "third_party" / "acme-qrl" / "src" / "acme_qrl"
+GOOD = (ACME / "environment.py").read_text().replace("] = 40", "] = 6") + LANES
 SPACES = "Box(0, 1, (2,)), Discrete(2)"
 STREAM = "self.streams[lane // per_stream].random() for lane in lanes"
 SEEN, REWARD, DONE, INFOS = (
@@ -85,7 +88,7 @@ EDITS = [
     edit("gymnasium", r"is non-deterministic .*: is super\(\).reset\(seed=seed\) called",
          "super().reset(seed=seed)", ""),
     edit("gymnasium", r"make\('.*'\) fails: .* its keyword arguments",
-         "size: int = 10, steps: int = 20", "", "size, steps", "10, 6"),
+         "channels=5, steps=40", "", "= channels, steps", "= 5, 6", "(channels)", "(5)"),
     edit("gymnasium", r"^check_env warns: Expects `terminated` signal to be a boolean",
          "reward, ended, False", "reward, int(ended), False"),
     edit("spaces", r"nothing returned NoneType, .*LaneEnv: is `return` there", vector="nothing"),
@@ -95,7 +98,7 @@ EDITS = [
     edit("spaces", r"^the action space Box\(-inf, inf, .* has no bounds: state finite ones",
          SPACES, "Box(0, 1, (2,)), Box(-np.inf, np.inf, (1,))"),
     edit("spaces", r"^environment '.*': the action space Box\(-inf, inf, .* has no bounds",
-         "Discrete(3)", "Box(-np.inf, np.inf, (1,))", "int(action)", "int(action[0] > 0)", vector=None),
+         "Discrete(channels)", "Box(-np.inf, np.inf, (1,))", "action == self.free", "action[0] > 0", vector=None),
     edit("spaces", r"actions are Discrete\(2, start=1\); in lanes they count from 0",
          SPACES, SPACES.replace("Discrete(2", "Discrete(2, start=1")),
     edit("spaces", r"observations are Discrete\(4\); networks need a gymnasium.spaces.Box",
@@ -170,7 +173,7 @@ def spec(*changes: str, vector: str | None = "Lanes") -> EnvironmentSpec:
         "Breaks a rule",
         f"{name}:Options",
         f"{name.title()}-v0",
-        f"{name}:Walk",
+        f"{name}:ChannelHop",
         None if vector is None else f"{name}:{vector}",
     )
 
