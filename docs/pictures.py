@@ -66,10 +66,11 @@ class Screenshot:
 
 @dataclass(frozen=True)
 class Unpublished:
-    """A picture of runs that are not published: the command trains them, draws it, and says where it lies."""
+    """A picture of runs that are not published: a command that trains them, if it is one, and the one that draws it."""
 
     command: str
     program: str = "qrlsuite"
+    trained: str = ""
 
 
 Picture = Plot | Screenshot | Unpublished
@@ -98,12 +99,16 @@ PICTURES: dict[str, Picture] = {
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
-    "study-deploy-errors.png": Unpublished("plot errors --study deploy"),  # `study run deploy --seeds 20`
-    "study-deploy-shots.png": Unpublished("plot shots --study deploy"),
-    "study-shots-costs.png": Unpublished(
-        "plot costs --study shots"
-    ),  # `study run shots --seeds 20 --epochs 30`
-    "study-shots-curves.png": Unpublished("plot curves --study shots"),
+    "study-deploy-errors.png": Unpublished(
+        "plot errors --study deploy", trained="study run deploy --seeds 20"
+    ),
+    "study-deploy-shots.png": Unpublished("plot shots --study deploy", trained="study run deploy --seeds 20"),
+    **{
+        f"study-shots-{kind}.png": Unpublished(
+            f"plot {kind} --study shots", trained="study run shots --seeds 20 --epochs 30"
+        )
+        for kind in ("costs", "curves")
+    },
     "study-ablation-layers.png": Plot(
         "plot layers --study ablation --published --seeds 20",
         ("entries/beam6g/ddqn-vqc-native-*", "unranked/beam6g/ddqn-vqc-native-*"),
@@ -188,8 +193,12 @@ def gallery() -> str:
     for name, caption in CAPTIONS.items():
         picture = PICTURES[name]
         note = "\nIts runs are not published: the command needs agents or seeds that you train.\n"
-        program = picture.program if isinstance(picture, Unpublished) else "qrlsuite"
-        text += f"\n## {caption}\n\n```sh\n{program} {picture.command}\n```\n"
+        lines = [f"qrlsuite {picture.command}"]
+        if isinstance(picture, Unpublished):
+            lines = [f"qrlsuite {picture.trained}"] * bool(picture.trained) + [
+                f"{picture.program} {picture.command}"
+            ]
+        text += "\n".join([f"\n## {caption}\n\n```sh", *lines, "```\n"])
         text += note * isinstance(picture, Unpublished) + f"\n![{caption}](images/{name})\n"
     return text
 
