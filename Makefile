@@ -49,7 +49,7 @@ test-lowest:
 	  --torch-backend cpu --editable . 'pytest>=8.2' 'hypothesis>=6.100' 'qiskit-qasm3-import>=0.6'
 	$(VENV)-lowest/bin/python -m pytest -q -W default $(LOWEST) -k 'not what_comes_next'
 
-# Published entries and plans in which this checkout differs from BASE: hashes, files, and RERUN seeds of each entry
+# Published entries and studies in which this checkout differs from BASE: hashes, files, and RERUN seeds of each entry
 # trained again. What they are called reaches no shell, and neither do BASE and RERUN.
 BASE ?= origin/main
 RERUN ?= 2
@@ -81,7 +81,7 @@ site: docs
 	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board.html
 
 # Every picture of docs/images that shows published entries (docs/pictures.py lists all, with their commands), and the
-# tables of published boards and plans.
+# tables of published boards and studies.
 pictures: install-dev
 	$(BIN)/python docs/pictures.py
 	$(BIN)/python docs/tables.py

@@ -1,6 +1,6 @@
 """The table of the paper's statements, `docs/statements.csv`: `make statements` computes it from what is published.
 
-A row's evidence begins with what it compares: a pair of entries, two tasks or two algorithms, or a plan. Its verdict
+A row's evidence begins with what it compares: a pair of entries, two tasks or two algorithms, or a study. Its verdict
 and its numbers follow. Numbers inside sentences are those of `FACTS` and `ANTENNAS`. A row without any of these is
 prose. `expected` says what the paper expects of the first entry: fewer steps than the second, as many in most cells or
 in nearly all, no fewer, or slightly more.
@@ -41,7 +41,7 @@ PAIR = re.compile(
     r"(?:study `(?P<study>[\w-]+)`, )?(?P<task>[\w+-]+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`"
 )
 EVERY_MODEL = re.compile(r"`(?P<first>[^`]+)` against `(?P<second>[^`]+)`(?: on `(?P<task>[^`]+)`)?: ")
-PLAN = re.compile(r"plan \[([\w-]+)\]")
+STUDY = re.compile(r"study \[([\w-]+)\]")
 PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;]+?)(?=;|$)")
 NUMBER = r"[-+]?\d+(?:\.\d+)?%?"
 RETUNED = " lr=0.002"
@@ -210,8 +210,8 @@ def every_model(row: Row, match: re.Match[str]) -> Row:
 # --- studies with looks
 
 
-def planned(row: Row, match: re.Match[str]) -> Row:
-    """Return the row of some pairs of a published plan: each has the plan's verdict."""
+def of_study(row: Row, match: re.Match[str]) -> Row:
+    """Return the row of some pairs of a published study with looks: each has the study's verdict."""
     pairs = {
         versus(each): each for each in published_studies.read(published_studies.PUBLISHED / match[1]).pairs
     }
@@ -522,8 +522,8 @@ def computed(rows: list[Row]) -> list[Row]:
             new = pair(row, match)
         elif match := EVERY_MODEL.match(evidence):
             new = every_model(row, match)
-        elif match := PLAN.match(evidence):
-            new = planned(row, match)
+        elif match := STUDY.match(evidence):
+            new = of_study(row, match)
         else:
             new, found = with_facts(row)
             facts.update(found)

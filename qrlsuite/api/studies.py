@@ -16,6 +16,7 @@ from rich.console import Console
 from qrlsuite import registry, specs
 from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
 from qrlsuite.engine import missing
+from qrlsuite.engine.budget import seconds
 from qrlsuite.engine.terminal import command
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError
@@ -277,7 +278,7 @@ def find_studies(
 def train_studies(
     every: Sequence[Overview], where: Where, budget: str | None, progress: bool
 ) -> Iterator[Overview]:
-    """Train study after study within one budget; return what each has and lacks then.
+    """Train study after study until the budget ends; yield what each has and lacks then.
 
     Raises
     ------
@@ -290,7 +291,10 @@ def train_studies(
     missing.check_budget(budget, where)
     works, began = [work for each in every for work in each.works], time.monotonic()
     missing.settle_codes(works[0].runs, [work.entry for work in works], where, quiet=not progress)
-    for each in every:
+    limit = seconds(budget, where.workers)
+    for place, each in enumerate(every):
+        if place and limit is not None and time.monotonic() - began >= limit:
+            return
         if len(every) > 1:
             console.print(f"\nstudy {each.study.name}: {each.study.summary}")
         now = each.now(where)

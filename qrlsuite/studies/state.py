@@ -225,11 +225,7 @@ class State(Shown):
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show `parts`."""
-        yield from self.parts()
-
-    def parts(self) -> Iterator[Text | Sheet]:
-        """Return the parts of a screen: the question; the design before the first seed, later the pairs; the cost."""
+        """Show the question; the design before the first seed, later the pairs; the cost."""
         study, facts = self.study, self.as_dict()
         yield Text(f"{study.name}: {study.file.summary}", style="bold")
         if not self.begun:

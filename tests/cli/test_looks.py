@@ -448,16 +448,6 @@ def test_every_record_of_a_seed_has_the_hash_of_its_study() -> None:
     assert tables[0] == tables[1]
 
 
-def test_no_rule_for_a_fixed_number_of_seeds_judges_the_entries() -> None:
-    run(write())
-    where = ("--runs", "runs/decisions/widths")
-    ranked = say("leaderboard", *where, "--format", "json")
-    assert json.loads(ranked.stdout)["sections"] == []
-    assert ranked.output.count("trained by a study with looks") == 3
-    with pytest.raises(QrlSuiteError, match="'ddqn mlp width=16' was trained by a study with looks"):
-        say("compare", "mlp width=16", "mlp width=4", *where)
-
-
 def _entry(setting: str) -> Entry:
     return resolve("tiny.toml", f"mlp {setting}")
 

@@ -22,7 +22,7 @@ def test_the_named_tests_exist() -> None:
 
 
 def test_every_door_has_its_promises() -> None:
-    doors = ("Plugins", "Task, study", "Entries", "Published plans", "Results folders")
+    doors = ("Plugins", "Task, study", "Entries", "Published studies", "Results folders")
     for door in (*doors, "Trackers", "Dask clusters", "The leaderboard's page"):
         (section,) = re.findall(rf"^\*\*{door}.*?(?=^\*\*|^## )", TEXT, re.MULTILINE | re.DOTALL)
         assert re.search(r"\b(?:is|are) (?:not )?trusted|are plugins", section), door

@@ -143,7 +143,7 @@ def test_a_badly_named_file_can_be_removed(repository: Path) -> None:
     assert changed("HEAD", repository) == ([], [])
 
 
-def test_the_command_checks_entries_and_plans_that_differ(repository: Path) -> None:
+def test_the_command_checks_entries_and_studies_that_differ(repository: Path) -> None:
     done = qrlsuite("verify", "--base", "HEAD", cwd=repository)
     assert (done.returncode, done.stdout) == (0, "no entry differs from HEAD\n")
     shutil.copytree(published_studies.PUBLISHED / PLAN, repository / "leaderboard" / "plans" / PLAN)
