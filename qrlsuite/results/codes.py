@@ -59,7 +59,7 @@ class CodeOfFolder:
 def of(store: EntryStore) -> CodeOfFolder | None:
     """Return the code of an entry's folder; None without a seed.
 
-    A seed without a finished epoch does not count: any code may begin it anew.
+    A seed without a finished epoch or a probe does not count: any code may begin it anew.
     """
     for seed in store.seeds() if (store.path / "entry.json").exists() else ():
         folder = store.seed(seed)
@@ -67,7 +67,9 @@ def of(store: EntryStore) -> CodeOfFolder | None:
             record = folder.record()
         except StoreError:  # is said where the seed is read
             continue
-        if record is not None and (record.epochs or folder.lines.exists() or folder.table.exists()):
+        if record is None:
+            continue
+        if record.epochs or record.probe is not None or folder.lines.exists() or folder.table.exists():
             digest = UNKNOWN if record.code is None else record.code.digest
             return CodeOfFolder(record.code_identity, linked(store.record(), [digest]))
     return None

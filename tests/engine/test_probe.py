@@ -124,6 +124,14 @@ def test_dependent_seeds_end_the_run_and_are_not_ranked(acme: Acme) -> None:
     )
 
 
+def test_corrected_code_begins_anew_beside_dependent_seeds(acme: Acme) -> None:
+    acme.run("class_attribute", "2", code=2)  # two seeds are probed before their first epoch
+    assert EntryStore(acme.entry()).seed(0).epochs() == []
+    path = acme.site / "bad_plugins.py"
+    path.write_text(path.read_text().replace("forward(x) * ClassAttribute.gain", "forward(x)"))
+    assert "2 seeds complete" in acme.run("class_attribute", "2")
+
+
 def test_another_group_of_dependent_seeds_stops_too(acme: Acme) -> None:
     acme.run("class_attribute", "6", "--workers", "2", "--epochs", "100000", code=2)
     assert len(acme.probes()) == 6
