@@ -272,8 +272,6 @@ def test_shots_and_noise_make_another_entry_and_defaults_the_same():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"shots": 0}, "shots = 0: .*greater than or equal to 1"),
-        ({"noise_model": "thermal"}, "noise_model = 'thermal': .*'depolarizing'"),
         ({"noise_rate": 0.02}, "noise_rate = 0.02 needs noise_model = 'depolarizing'"),
         ({"readout_error": 0.02}, "readout_error = 0.02 needs noise_model = 'depolarizing'"),
         ({"trajectories": 10}, "trajectories = 10 needs noise_model = 'depolarizing'"),

@@ -75,13 +75,8 @@ def test_links_are_not_followed(two: tuple[Path, Path], tmp_path: Path) -> None:
 
 def test_mistakes_say_what_to_type(two: tuple[Path, Path], tmp_path: Path) -> None:
     runs = tmp_path / "runs"
-    for names, message in (
-        (["mpl width=8"], "did you mean 'mlp width=8'"),
-        (["mlp"], "may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"),
-        (["mlp width=8", "mlp"], "may be any of"),
-    ):
-        with pytest.raises(UnknownNameError, match=message):
-            call(runs, "rm", *names, "--yes")
+    with pytest.raises(UnknownNameError, match="may be any of"):
+        call(runs, "rm", "mlp width=8", "mlp", "--yes")
     for words, message in (
         (("rm",), "Missing argument 'ENTRY...'"),
         (("gc", "mlp"), "unexpected extra argument"),

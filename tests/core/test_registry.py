@@ -15,7 +15,7 @@ import pytest
 
 import qrlsuite
 from qrlsuite import registry, specs
-from qrlsuite.errors import PluginError, UnknownNameError
+from qrlsuite.errors import PluginError
 from qrlsuite.hookspecs import hookimpl
 from tests.conftest import installed
 from tests.core.test_dependencies import ALL
@@ -66,11 +66,6 @@ def test_a_model_for_every_circuit_backend_is_one_on_each_whichever_comes_first(
     ]  # fmt: skip
     found.remove("later")
     assert sorted(models) == ["waves-first", "waves-own"]
-
-
-def test_an_unknown_name_gets_the_nearest_match() -> None:
-    with pytest.raises(UnknownNameError, match="unknown model 'mpl'; did you mean 'mlp'"):
-        registry.load().get(specs.ModelSpec, "mpl")
 
 
 def test_a_name_registered_twice_names_both_distributions() -> None:

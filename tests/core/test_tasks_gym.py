@@ -125,19 +125,6 @@ def test_names_of_tasks_without_a_file_are_names() -> None:
     assert quick_name("phys2d/CartPole-v1") == "gym-phys2d-cartpole-v1"
 
 
-@pytest.mark.parametrize(
-    ("env_id", "message"),
-    [
-        ("Acrobat-v1", "knows no environment 'Acrobat-v1'; did you mean 'Acrobot-v1'"),
-        (f"{HERE}:Unbounded-v0", "has no bounds: state finite ones"),
-        ("", "knows no environment ''"),
-    ],
-)
-def test_tasks_without_a_file_that_cannot_be(env_id: str, message: str) -> None:
-    with pytest.raises(OptionError, match=message):
-        task.load(f"gym:{env_id}")
-
-
 def test_a_quick_look_from_the_command_line(tmp_path: Path) -> None:
     shown = json.loads(cli("show", "task", "gym:FrozenLake-v1", "--json", cwd=tmp_path).stdout)
     assert shown["ranking"]["thresholds"] == pytest.approx([0.35, 0.525, 0.7])
@@ -150,13 +137,6 @@ def test_a_quick_look_from_the_command_line(tmp_path: Path) -> None:
     summary = json.loads(done.stdout)
     assert (summary["task"], summary["seeds"], summary["epochs"]) == ("gym-frozenlake-v1", 2, 2)
     assert 0 <= summary["median_score"] <= 1
-    wrong = cli("run", "ddqn mlp", "--task", "gym:Pendulum-v1", "--seeds", "1", "--runs", "tmp", cwd=tmp_path)
-    assert wrong.returncode == 2
-    assert not (tmp_path / "tmp" / "gym-pendulum-v1").exists() or not list((tmp_path / "tmp").rglob("seed-*"))
-    assert wrong.stderr.count("qrlsuite: ") == 1
-    assert (
-        "'ddqn' takes discrete actions, and those of task 'gym-pendulum-v1' are Box(-2.0, 2.0" in wrong.stderr
-    )
 
 
 TASK = """

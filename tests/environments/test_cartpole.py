@@ -176,8 +176,6 @@ def test_running_statistics_are_asked_for_in_lanes_and_refused_alone() -> None:
     ("options", "message"),
     [
         ({"steps": 0}, "environment 'cartpole': steps = 0: .*greater than or equal to 1"),
-        ({"normalisation": "none"}, "no option 'normalisation'; did you mean 'normalization'"),
-        ({"normalization": "z"}, "normalization = 'z': .*'none', 'bounds', 'arctan' or 'running'"),
         ({"bounds": [1, 2, 3]}, "bounds"),
         ({"bounds": [1, 2, 3, 0]}, "every bound must be a positive, finite number"),
     ],

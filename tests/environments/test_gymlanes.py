@@ -291,8 +291,6 @@ def test_normalizations() -> None:
         ({"id": "FrozenLke-v1"}, "id = 'FrozenLke-v1': .*did you mean 'FrozenLake-v1'"),
         ({"arguments": {"max_episode_steps": 5}}, "'max_episode_steps' cannot be given here; use the option"),
         ({"arguments": {"render_mode": "human"}}, "'render_mode' cannot be given here; use nothing"),
-        ({"max_episode_steps": 0}, "max_episode_steps = 0"),
-        ({"normalization": "z"}, "normalization = 'z'"),
     ],
 )
 def test_options_that_cannot_be(values: dict[str, Any], message: str) -> None:

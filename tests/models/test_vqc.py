@@ -181,20 +181,6 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     assert (default.qubits, default.layers, default.ansatz) == (10, 4, "iqp")
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"qubits": 0}, "qubits = 0: .*greater than or equal to 1"),
-        ({"gate": "rott"}, "gate = 'rott'"),
-        ({"dtype": "float16"}, "dtype = 'float16'"),
-        ({"activation": "relu"}, "no option 'activation'; did you mean 'activation_in'?"),
-    ],
-)
-def test_bad_options_are_refused(values, message):
-    with pytest.raises(OptionError, match=message):
-        small(**values)
-
-
 def test_options_of_a_backend_join_those_of_the_model():
     """Of two that have one name, it is not known which is meant."""
 
