@@ -294,6 +294,8 @@ def test_other_code_neither_plays_nor_exports_what_was_trained_and_imports_it_ap
 def test_a_results_folder_is_taken_over_with_all_codes(trained: Author) -> None:
     trained.edit("own_helper", "rand(", "randn(")
     assert trained.run(model="line").returncode == 0
+    first, *_ = sorted(trained.runs.glob("tiny/*"))
+    assert "has seeds of the installed code" in trained.command("evaluate", str(first)).stderr
     before, trained.runs = trained.runs, trained.folder / "more"
     held = sorted(path.relative_to(before) for path in before.glob("*/*/seed-*/run.json"))
     assert len(held) == 4
