@@ -224,8 +224,8 @@ def summarize(work: Missing) -> dict[str, Any]:
     grid, sign = file.ranking.grid, file.score.sign
     return {
         "task": work.entry.task.name,
-        "entry": work.entry.name,
-        "label": work.entry.label,
+        "entry": f"{work.entry.name}{store.mark}",
+        "label": f"{work.entry.label} {store.mark}".rstrip(),
         "folder": str(store.path),
         "seeds": len(complete),
         "epochs": epochs,

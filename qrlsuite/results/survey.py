@@ -78,7 +78,7 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
         folder=store.path,
         task=store.path.parent.name if record is None else record.task_name,
         name=store.path.name,
-        label=" ".join(["?" if record is None else record.label, store.mark]).rstrip(),
+        label=f"{'?' if record is None else record.label} {store.mark}".rstrip(),
         seeds=dict(Counter(statuses.values())),
         epochs=(min(epochs), max(epochs)) if epochs else None,
         size=size,
@@ -96,8 +96,8 @@ def outline(store: EntryStore) -> dict[str, Any]:
     for origin in (origin.content for run in records if run is not None for origin in run.provenance):
         made_with += [origin] if origin not in made_with else []
     return {
-        "label": record.label,
-        "name": record.name,
+        "label": f"{record.label} {store.mark}".rstrip(),
+        "name": f"{record.name}{store.mark}",
         "hash": record.hash,
         "preset": record.preset,
         "tuning": record.tuned,
