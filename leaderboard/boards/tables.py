@@ -237,6 +237,9 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
         "diverged (numbers of the agents are no longer finite), judged with the scores that they had": {
             entry.label: _of_seeds(entry) for entry in entries if entry.diverged
         },
+        "settings that are of no use in runs of this length": {
+            entry.label: "; ".join(entry.unusable) for entry in entries if entry.unusable
+        },
         "unfinished seeds, left out": {
             entry.label: format_seeds(entry.left_out) for entry in entries if entry.left_out
         },

@@ -494,6 +494,17 @@ class EntryResults(Shown):
         changed = [option for option, value in usual.items() if own.get(option, value) != value]
         return f"{name} but {', '.join(changed)}" if changed else name
 
+    @cached_property
+    def unusable(self) -> list[str]:
+        """Settings of the algorithm that are of no use in runs of this length, by its own account."""
+        finished = any(run.finished for run in self.records.values())
+        if self.external or not finished:
+            return []
+        try:
+            return self.record.entry(f"{self.folder}").unusable(self.longest)
+        except QrlSuiteError:
+            return []  # its parts are not installed
+
     @property
     def on_protocol_seeds(self) -> bool:
         """Whether its settings are known to have been chosen on the seeds that judge it."""

@@ -31,7 +31,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite import masks
-from qrlsuite.algorithm import BuildModel
+from qrlsuite.algorithm import BuildModel, rare_copies
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, chosen_errors, chosen_values, part, prefixed
@@ -68,6 +68,10 @@ class DDQNOptions:
         Field(ge=1, description="gradient steps between copies to the target"),
         Tuned(125, 8000, per_agent=True),
     ] = 2000
+
+    def unusable(self, epochs: int, rounds: int, environments: int) -> list[str]:
+        """Name settings that are of no use in a run of this length, see `qrlsuite.algorithm.Algorithm`."""
+        return rare_copies(self.target_steps, epochs * rounds)
 
 
 class DDQN:

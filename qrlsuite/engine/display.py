@@ -306,8 +306,9 @@ class RunDisplay:
         parts += [f"{resumed} resume{'s' * (resumed == 1)} at epoch {_range(begun)}"] if resumed else []
         end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
         self.console.print("; ".join(parts) + "." + end)
-        if self.expected is not None:
-            self.console.print(self.expected, markup=False, soft_wrap=True)
+        notes = [f"note: {line}" for line in self.entry.unusable(self.epochs)]
+        for line in [*notes, *filter(None, [self.expected])]:
+            self.console.print(line, markup=False, soft_wrap=True)
         if submits:
             return
         self.bar.start(todo * self.epochs, "starting")

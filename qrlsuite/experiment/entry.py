@@ -152,6 +152,12 @@ class Entry:
             if isinstance(name, str) and name in known.of(kind)
         }
 
+    def unusable(self, epochs: int) -> list[str]:
+        """Name settings of the algorithm that are of no use in a run of so many epochs, by its own account."""
+        protocol = self.task.file.protocol
+        own = getattr(self.algorithm_options, "unusable", None)
+        return [] if own is None else list(own(epochs, protocol.rounds, protocol.environments))
+
     def distributions(self) -> list[str]:
         """Return the distributions whose code makes the entry's numbers, each once."""
         return list(dict.fromkeys(each.distribution for each in self.registered().values()))

@@ -12,6 +12,7 @@ import numpy as np
 from qrlsuite import options, registry, specs
 from qrlsuite.actions import draw
 from qrlsuite.errors import QrlSuiteError
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.task import Task, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
@@ -39,6 +40,7 @@ def check(subject: Subject) -> list[Finding]:
     rules.run("says what is registered", "name and summary are the file's", lambda: _names(spec, task))
     rules.run("identity", "the same hash every time", lambda: _identity(spec, task))
     rules.run("algorithms", "the default one and those with presets exist", lambda: _algorithms(task))
+    rules.run("settings", "of use in a run of the protocol's length", lambda: _settings(task))
     rules.run("ranking", "horizons are whole epochs, within a complete run", lambda: _ranking(task))
     rules.run("scores", "episodes end with a score, in [0, 1] where it is relative", lambda: _scores(task))
     return rules.findings
@@ -117,6 +119,23 @@ def _algorithm(location: str, name: str, values: Mapping[str, Any] | None = None
         raise BrokenRuleError(f"{location}: {error}") from error
 
 
+def _settings(task: Task) -> None:
+    """Require that a complete run can use every setting: a target network that is never copied learns nothing."""
+    model = registry.get(specs.ModelSpec, specs.NO_MODEL)
+    chosen = [(preset, name) for preset, by_algorithm in task.file.presets.items() for name in by_algorithm]
+    for preset, name in [(None, task.file.default_algorithm), *chosen]:
+        for family in ("classical", "quantum"):
+            try:
+                spec = registry.get(specs.AlgorithmSpec, name)
+                used, values = task.preset(preset, name, family)
+                given = options.build(specs.resolve(spec.options), values, f"algorithm '{name}'")
+            except QrlSuiteError:
+                continue  # another rule names it, or the preset is for the other family
+            unusable = "; ".join(Entry(task, spec, model, given, None, used).unusable(task.epochs(name)))
+            place = f"[presets.{used or 'default'}.{name}.all]"
+            require(not unusable, f"{unusable}: write another value in {place}, or raise protocol.epochs")
+
+
 def _ranking(task: Task) -> None:
     protocol = task.file.protocol
     complete = max(protocol.epochs, *protocol.algorithm_epochs.values(), 0) * protocol.interactions
@@ -129,7 +148,6 @@ def _ranking(task: Task) -> None:
 
 
 def _scores(task: Task) -> None:
-    from qrlsuite.experiment.entry import Entry
     from qrlsuite.training.trainer import build_envs
 
     known = registry.load()

@@ -121,6 +121,11 @@ def test_by_name_every_rule_is_shown_and_a_broken_one_is_exit_code_1(check: Comm
 
 def test_a_task_of_one_s_own_is_checked(check: Command, tiny_task: str) -> None:
     code, out, err = check(tiny_task)
+    assert (code, err) == (1, "")
+    assert "target_steps=2000 never copies the target network in 45 gradient steps" in out
+    text = Path(tiny_task).read_text().replace("[environment]", 'default_preset = "short"\n[environment]', 1)
+    Path(tiny_task).write_text(f"{text}\n[presets.short.ddqn.all]\ntarget_steps = 9\n")
+    code, out, err = check(tiny_task)
     assert (code, err) == (0, "")
     assert "  ✓ scores: " in out
 

@@ -60,6 +60,9 @@ def register_environments(register):
     for name in ("Plain", "Numbered"):
         register(EnvironmentSpec(name.lower(), "Strange", f"strange:{name}", "Strange-v0", None, "strange:Lanes"))
 '''
+GOOD = TINY.replace("[environment]", 'default_preset = "short"\n[environment]', 1).replace(
+    "[ranking]", "[presets.short.ddqn.all]\ntarget_steps = 9\n[ranking]"
+)
 BEAM = TINY[TINY.index('name = "beam6g"') : TINY.index("[protocol]")]
 
 
@@ -84,6 +87,10 @@ TASKS = [
          "[ranking]", "[presets.fast.ppoo.all]\n[ranking]"),
     edit("algorithms", r"^\[presets.fast.ddqn\]: algorithm 'ddqn' has no option 'lrr'; did you mean 'lr'",
          "[ranking]", "[presets.fast.ddqn.quantum]\nlrr = 1\n[ranking]"),
+    edit("settings", r"^target_steps=40 copies the target network once in 45 gradient steps, first after 89% of the "
+         r"run: write another value in \[presets.short.ddqn.all\]", "target_steps = 9", "target_steps = 40"),
+    edit("settings", r"^target_steps=2000 never copies .* in 45 gradient steps: .*presets.default",
+         'default_preset = "short"\n', ""),
     edit("format", r"horizons: 50 steps are not a whole number of epochs of 60", "[180]", "[180, 50]"),
     edit("format", r"horizons: 100 steps are not a whole number .* epochs of 60 steps", "[180]", "[100]"),
     edit("ranking", r"240 lies beyond a complete run, 180 interactions: no entry .* raise", "[180]", "[240]"),
@@ -118,19 +125,19 @@ def spec(path: Path | str) -> TaskSpec:
 @pytest.mark.parametrize("edit", TASKS, ids=ids(TASKS))
 def test_one_rule_is_broken(edit: Edit, tmp_path: Path) -> None:
     path = tmp_path / "tasks.toml"
-    path.write_bytes(edit.of(TINY).encode("latin-1"))
+    path.write_bytes(edit.of(GOOD).encode("latin-1"))
     assert_breaks(spec(path), edit.rule, edit.message)
 
 
 def test_a_file_is_where_the_spec_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     message = r"missing.toml is not there: is the TOML file among the package data, \[tool.setuptools.package-data\]"
     assert_breaks(spec(tmp_path / "missing.toml"), "file", message)
-    (tmp_path / "tasks.toml").write_text(TINY)
+    (tmp_path / "tasks.toml").write_text(GOOD)
     monkeypatch.chdir(tmp_path)
     message = r"is relative to the folder where .* write str\(Path\(__file__\).parent / ...\)"
     assert_breaks(spec("tasks.toml"), "file", f"path = 'tasks.toml' {message}")
 
 
 def test_every_rule_has_a_file_that_breaks_it(tmp_path: Path) -> None:
-    (tmp_path / "tasks.toml").write_text(TINY)
+    (tmp_path / "tasks.toml").write_text(GOOD)
     assert assert_all_good(spec(tmp_path / "tasks.toml")) == {edit.rule for edit in TASKS} | {"file"}
