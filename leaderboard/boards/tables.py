@@ -144,14 +144,13 @@ def _rank_notes(section: Section) -> list[str]:
         if times.n_pairs
         else "no pair to test"
     )
-    lines = [
+    few = any(row.time.ranks is None for row in section.rows)
+    return [
         f"rank: by significant outperformance: {pairs}",
+        *[TOO_FEW] * few,
         f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.ranking.cell}"
         + policies_text(section),
     ]
-    if any(row.time.ranks is None for row in section.rows):
-        lines.append(TOO_FEW)
-    return lines
 
 
 def policies_text(section: Section) -> str:
@@ -237,8 +236,9 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
         "diverged (numbers of the agents are no longer finite), judged with the scores that they had": {
             entry.label: _of_seeds(entry) for entry in entries if entry.diverged
         },
-        "settings that are of no use in runs of this length": {
-            entry.label: "; ".join(entry.unusable) for entry in entries if entry.unusable
+        **{
+            sentence: {entry.label: "" for entry in entries if sentence in entry.unusable}
+            for sentence in dict.fromkeys(line for entry in entries for line in entry.unusable)
         },
         "unfinished seeds, left out": {
             entry.label: format_seeds(entry.left_out) for entry in entries if entry.left_out
