@@ -28,7 +28,16 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from importlib.machinery import ModuleSpec
+from importlib.machinery import (
+    BYTECODE_SUFFIXES,
+    EXTENSION_SUFFIXES,
+    SOURCE_SUFFIXES,
+    ExtensionFileLoader,
+    FileFinder,
+    ModuleSpec,
+    SourceFileLoader,
+    SourcelessFileLoader,
+)
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -137,8 +146,8 @@ def _cache() -> Path:
     """Return the folder of copies: below `QRLSUITE_CACHE` or the user's cache folder, else a temporary one."""
     standard = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     for base in filter(None, (os.environ.get("QRLSUITE_CACHE"), standard)):
-        folder = Path(base).expanduser() / "qrlsuite" / "plugins"
         with contextlib.suppress(OSError, RuntimeError):
+            folder = Path(base).expanduser().absolute() / "qrlsuite" / "plugins"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
@@ -159,7 +168,7 @@ def copy(source: Source, folder: Path) -> Path:
 
     def is_there() -> bool:
         found = {file.relative_to(place).as_posix(): file.read_bytes() for file in walk(place)}
-        return found == dict(source.files)
+        return found == dict(source.files) and not any(path.is_symlink() for path in place.rglob("*"))
 
     try:
         if not is_there():
@@ -282,10 +291,15 @@ def _file(shown: str, place: Path) -> dict[str, bytes]:
             elif (folder / "__init__.py").is_file():
                 found |= _folder(f"{shown}, which imports {module},", folder)
         for data in _declared(tree):
-            file = (place.parent / name).parent / data
-            if not file.resolve().is_relative_to(place.parent.resolve()):
+            file = Path(os.path.normpath((place.parent / name).parent / data))
+            try:
+                inside = file.resolve().is_relative_to(place.parent.resolve())
+                is_there = file.is_file()
+            except (OSError, RuntimeError, ValueError):  # a loop of links, or what can be no path
+                inside, is_there = True, False
+            if not inside or not file.is_relative_to(place.parent):
                 raise PluginError(f"plugin {shown}: files names {data}, which is not in {place.parent}")
-            if not file.is_file():
+            if not is_there:
                 raise PluginError(f"plugin {shown}: files names {data}, and there is no such file")
             found[file.relative_to(place.parent).as_posix()] = _bytes(shown, file)
         left |= {file: content for file, content in found.items() if file not in files}
@@ -414,6 +428,8 @@ def _load(known: Registry, source: Source) -> Loaded:
     handed: list[tuple[Any, str]] = []
     _importing.append((source, handed))
     _forget(source)  # what Python may have imported from elsewhere
+    if _finder not in sys.path_hooks:
+        sys.path_hooks.insert(0, _finder)
     sys.path.insert(0, str(source.copy.parent))
     try:
         module = importlib.import_module(source.module)
@@ -439,6 +455,33 @@ def _load(known: Registry, source: Source) -> Loaded:
     if "gymnasium" in sys.modules:
         qrlsuite._register(known)
     return made
+
+
+class _Reader(SourceFileLoader):
+    """Imports what was read, not what may lie in its place, nor bytecode beside it."""
+
+    def path_stats(self, path: Any) -> Any:
+        raise OSError("bytecode is not used")
+
+    def get_data(self, path: Any) -> bytes:
+        for source in _sources():
+            if Path(path).is_relative_to(source.copy.parent):
+                content = source.files.get(Path(path).relative_to(source.copy.parent).as_posix())
+                if content is not None:
+                    return content
+        return super().get_data(path)
+
+
+def _finder(path: str) -> FileFinder:
+    """Find the modules of copies, for Python's `sys.path_hooks`."""
+    if not _is_copy(path):
+        raise ImportError(path)
+    return FileFinder(
+        path,
+        (ExtensionFileLoader, EXTENSION_SUFFIXES),
+        (_Reader, SOURCE_SUFFIXES),
+        (SourcelessFileLoader, BYTECODE_SUFFIXES),
+    )
 
 
 def _recognized(module: ModuleType, source: Source) -> list[Registered[Any]]:

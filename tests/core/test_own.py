@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import marshal
 import os
 import sys
 import textwrap
@@ -497,6 +499,16 @@ def test_data_outside_of_the_files_folder_is_not_read(data: str) -> None:
     assert f"files names {data}, which is not in " in refusal(write("here/ring.py", text))
 
 
+def test_data_is_named_by_its_place_however_it_is_written() -> None:
+    write("here/w.txt", "x")
+    Path("here/loop").symlink_to("loop")
+    text = "files = ['../here/w.txt', 'none/../w.txt']\ndef ring(qubits, layers): ...\n"
+    assert set(own.read(write("here/ring.py", text)).files) == {"ring.py", "w.txt"}
+    for name in ("loop", "w\\0"):
+        said = refusal(write("here/ring.py", f"files = ['{name}']\ndef ring(qubits, layers): ...\n"))
+        assert "and there is no such file" in said
+
+
 def test_undeclared_data_is_said_with_what_to_write() -> None:
     write("data.txt", "1")
     head = "from pathlib import Path\nfrom qrlsuite.circuit import Circuit\n"
@@ -521,6 +533,39 @@ def test_a_copy_that_was_changed_is_written_anew() -> None:
     made.source.copy.with_name("math.py").write_text("raise SystemExit\n")
     assert own.load("ring.py").source.copy.read_text() == RING
     assert not made.source.copy.with_name("math.py").exists()
+    own.unload(made)
+    made.source.copy.with_name("math.py").symlink_to(write("math.py", "raise SystemExit\n"))
+    own.load("ring.py")
+    assert not made.source.copy.with_name("math.py").is_symlink()
+
+
+def test_bytecode_beside_a_copy_does_not_run() -> None:
+    made = own.load(write("ring.py", RING))
+    own.unload(made)
+    other = compile("raise SystemExit('other code')", "ring.py", "exec")
+    place = Path(importlib.util.cache_from_source(made.source.copy))
+    place.parent.mkdir(exist_ok=True)
+    head = importlib.util.MAGIC_NUMBER + bytes(4)  # of a source file with this time and size
+    about = made.source.copy.stat()
+    head += int(about.st_mtime).to_bytes(4, "little") + about.st_size.to_bytes(4, "little")
+    place.write_bytes(head + marshal.dumps(other))
+    own.load("ring.py")
+
+
+def test_a_copy_that_is_changed_while_it_is_used_does_not_run() -> None:
+    write("side.py", "WIDTH = 2\n")
+    late = "from qrlsuite.circuit import Circuit\ndef ring(qubits, layers) -> Circuit:\n    import side\n"
+    made = own.load(write("ring.py", f"{late}    return Circuit(side.WIDTH)\n"))
+    made.source.copy.with_name("side.py").write_text("raise SystemExit\n")
+    assert circuit.ansatz("ring", 2, 1).qubits == 2
+
+
+def test_copies_lie_somewhere_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("QRLSUITE_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, "~nobody-of-this-name/cache")
+    folder = own._cache.__wrapped__()
+    assert folder.is_absolute()
+    assert folder.is_dir()
 
 
 def test_what_is_not_in_a_file_is_not_registered() -> None:
