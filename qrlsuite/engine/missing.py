@@ -116,14 +116,17 @@ def require_trainable(entries: Sequence[Entry], where: Where) -> None:
     """Refuse entries whose parts do not fit (wrong actions, say), before anything is trained or queued."""
     from qrlsuite.training import trainer  # imports torch
 
-    for entry in {entry.population_key: entry for entry in entries}.values():
+    alike: dict[str, list[Entry]] = {}
+    for entry in entries:
+        alike.setdefault(entry.population_key, []).append(entry)
+    for population in alike.values():
         try:
-            trainer.build_envs(entry, 1, lambda: None)
+            trainer.build_envs(population[0], 1, lambda: None)
         except QrlSuiteError:
             if where.remote:
                 continue
             raise
-        trainer.require_trainable(entry)
+        trainer.require_trainable(population)
 
 
 class _TimeIsUp(Exception):

@@ -14,7 +14,6 @@ from qrlsuite.actions import choices
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import EnvironmentFailure, PluginError, nearest
 from qrlsuite.experiment.task import ScoreSection
-from qrlsuite.training.fences import Fence
 
 
 class MeteredEnv(LaneEnv):
@@ -38,9 +37,7 @@ class MeteredEnv(LaneEnv):
         name: str,
         score: ScoreSection,
         tick: Callable[[], None],
-        fence: Fence | None = None,
     ) -> None:
-        self.fence = fence or Fence(closed=False)
         self.inner = inner
         self.environment_name = name
         self.score = score
@@ -59,8 +56,7 @@ class MeteredEnv(LaneEnv):
         """Reset every lane."""
         self.returns[:] = 0.0
         try:
-            with self.fence.around(f"environment '{self.environment_name}', reset"):
-                observations, infos = self.inner.reset(seed=seed, options=options)
+            observations, infos = self.inner.reset(seed=seed, options=options)
         except PluginError:
             raise
         except Exception as error:
@@ -71,8 +67,7 @@ class MeteredEnv(LaneEnv):
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step every lane."""
         try:
-            with self.fence.around(f"environment '{self.environment_name}', step"):
-                observations, rewards, terminated, truncated, infos = self.inner.step(actions)
+            observations, rewards, terminated, truncated, infos = self.inner.step(actions)
             if self.observe is not None:
                 self.observe(observations)
         except InvalidAction as error:

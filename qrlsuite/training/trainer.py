@@ -36,7 +36,7 @@ from qrlsuite.results.progress import Progress
 from qrlsuite.seeding import Streams, pack, stream_key, unpack
 from qrlsuite.training import unregistered
 from qrlsuite.training.device import find as find_device
-from qrlsuite.training.fences import Fence, seeded
+from qrlsuite.training.fences import seeded
 from qrlsuite.training.metering import MeteredEnv
 from qrlsuite.training.standardization import PREFIX, RunningStatistics
 
@@ -65,8 +65,8 @@ def _building(spec: specs.Spec) -> Iterator[None]:
         raise PluginError(f"{spec.title} of {owner} cannot be built: {own.failure(error)}") from error
 
 
-def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence | None = None) -> MeteredEnv:
-    """Build the task's environment with a number of lanes; `fence` watches its calls."""
+def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv:
+    """Build the task's environment with a number of lanes."""
     spec = entry.task.environment
     settings = entry.task.environment_options
     inner: LaneEnv
@@ -76,7 +76,7 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence 
         else:
             qrlsuite.register_environments()
             inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(settings))
-    return MeteredEnv(inner, spec.name, entry.task.file.score, tick, fence)
+    return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
 
 def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
@@ -105,14 +105,25 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
     )
 
 
-def require_trainable(entry: Entry) -> None:
-    """Refuse an algorithm, a model and a task that do not fit; one agent is built for it and not trained."""
+def require_trainable(entries: Sequence[Entry]) -> None:
+    """Refuse an algorithm, a model and a task that do not fit; agents are built for it and not trained.
+
+    A third party's model that hides state from torch is refused, too (`qrlsuite.training.unregistered`).
+
+    Parameters
+    ----------
+    entries:
+        One or more that one population can train.
+    """
+    entry = entries[0]
     if entry.model.name == specs.NO_MODEL:
         require_actions(entry, build_envs(entry, 1, lambda: None).single_action_space)
         return
     act = getattr(specs.resolve(entry.algorithm.factory), "act", len)
     if population.remembers(first_network(entry)) and not asks_for_more(act):
         raise _forgets(entry)
+    if entry.third_party():
+        Trainer(entries[:2], [0] * len(entries[:2]), checked=True)
 
 
 def _no_network(entry: Entry) -> OptionError:
@@ -295,9 +306,9 @@ class ModelBuilder:
 
     `entry` is the entry of all agents, or a list with one for each agent.
 
-    With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
-    refused (PluginError), see `qrlsuite.training.unregistered`. While an agent is built, the global generators have
-    states of its own stream, so that layers of torch may be built as they are. `fence` watches the passes.
+    With `statistics`, all of them standardize their observations by these. While an agent is built, the global
+    generators have states of its own stream, so that layers of torch may be built as they are. With `checked`, a model
+    that hides state from torch is refused (PluginError).
     """
 
     def __init__(
@@ -306,11 +317,10 @@ class ModelBuilder:
         envs: LaneEnv,
         streams: Sequence[Streams],
         statistics: RunningStatistics | None = None,
-        fence: Fence | None = None,
         initial: Mapping[int, Mapping[str, torch.Tensor]] | None = None,
+        checked: bool = False,
     ) -> None:
-        self.fence = fence or Fence(closed=False)
-        self.initial = initial or {}
+        self.initial, self.checked = initial or {}, checked
         self.entries = [entry] * len(streams) if isinstance(entry, Entry) else list(entry)
         self.entry = self.entries[0]
         self.space = observed_space(envs)
@@ -334,15 +344,14 @@ class ModelBuilder:
                     generator = streams.torch("init", call)
                     return build_agent(build, given, outputs, chosen, generator, self.space, role)
 
-            first = self.streams[0]
-            two = first, Streams(first.task_hash, first.seed + 1)
-            both = options[0], options[0]
-            stacked = spec.population is None
-            if stacked:  # a stack keeps one agent's plain attributes for all
-                both = options[0], next((chosen for chosen in options if chosen != options[0]), options[0])
-            unregistered.require_none(
-                lambda which: agent(two[which], both[which]), given, spec.name, stacked, outputs
-            )
+            if self.checked:
+                first = self.streams[0]
+                two = first, Streams(first.task_hash, first.seed + 1)
+                stacked = spec.population is None  # a stack keeps one agent's plain attributes for all
+                both = options[0], options[-1 if stacked else 0]
+                unregistered.require_none(
+                    lambda which: agent(two[which], both[which]), given, spec.name, stacked, outputs
+                )
             agents = [agent(streams, chosen) for streams, chosen in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))
@@ -360,7 +369,6 @@ class ModelBuilder:
             )
         if self.statistics is not None:
             self.statistics.attach(together)
-        self.fence.watch(together, f"model '{spec.name}', forward")
         self.built.append(together)
         return together
 
@@ -467,9 +475,10 @@ class Trainer:
         seeds: Sequence[int],
         device: str = "cpu",
         report: Report = lambda progress: None,
+        checked: bool = False,
     ) -> None:
         torch.set_num_threads(1)
-        self.seeds, self.report = list(seeds), report
+        self.seeds, self.report, self._checked = list(seeds), report, checked
         entries = [entry] * len(self.seeds) if isinstance(entry, Entry) else list(entry)
         distinct = {id(each): each for each in entries}.values()
         if len(entries) != len(self.seeds) or len({each.population_key for each in distinct}) > 1:
@@ -484,8 +493,7 @@ class Trainer:
         protocol = entry.task.file.protocol
         self.S, self.E, self.V = len(self.seeds), protocol.environments, protocol.validation_episodes
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
-        self.fence = Fence(closed=bool(entry.third_party()))
-        self.envs = build_envs(entry, self.S * self.E, self._tick, self.fence)
+        self.envs = build_envs(entry, self.S * self.E, self._tick)
         require_actions(entry, self.envs.single_action_space)
         size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
         self.statistics: RunningStatistics | None = None
@@ -498,7 +506,7 @@ class Trainer:
     def _build(self, initial: Mapping[int, Mapping[str, torch.Tensor]]) -> None:
         """Build networks and algorithm; `initial` has the networks' first parameters, by their number."""
         self.models = ModelBuilder(
-            self._entries, self.envs, self.streams, self.statistics, self.fence, initial
+            self._entries, self.envs, self.streams, self.statistics, initial, self._checked
         )
         with _building(self.entry.algorithm):
             factory = specs.resolve(self.entry.algorithm.factory)
@@ -520,7 +528,7 @@ class Trainer:
     @functools.cached_property
     def validation(self) -> MeteredEnv:
         """The validation's lanes, built when first needed: trained agents are also played without them."""
-        envs = build_envs(self.entry, self.S * self.V, self._tick, self.fence)
+        envs = build_envs(self.entry, self.S * self.V, self._tick)
         envs.inner.autoreset = False
         return envs
 
@@ -580,8 +588,7 @@ class Trainer:
         self._phase("training", rounds)
         if self.statistics is not None:
             self.statistics.adopt()
-        with self.fence.around(f"{self._called()}, train_epoch", fine=False):
-            metrics = dict(self.algorithm.train_epoch(rounds))
+        metrics = dict(self.algorithm.train_epoch(rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained, between = time.perf_counter(), self.models.executions()
         self.progress.warnings += [p for p in self.models.problems() if p not in self.progress.warnings]
@@ -691,8 +698,7 @@ class Trainer:
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
         self.validation.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
         try:
-            with self.fence.around(f"{self._called()}, validation", fine=False):
-                episodes = play_episodes(self.validation, lambda: self.act)
+            episodes = play_episodes(self.validation, lambda: self.act)
         finally:
             with torch.no_grad():
                 for buffer, value in zip(buffers, before):
@@ -729,8 +735,7 @@ class Trainer:
         if self._informed:
             more = None if begins is None else begins.reshape(seen.shape[:2]), told
         heeds = {"infos": told} if self._heeds and not self._informed else {}
-        with self.fence.around(f"algorithm '{self.entry.algorithm.name}', act"):
-            actions: NDArray[Any] = self.algorithm.act(seen, *more, **heeds)
+        actions: NDArray[Any] = self.algorithm.act(seen, *more, **heeds)
         shape = *seen.shape[:2], *(self.envs.single_action_space.shape or ())
         if np.shape(actions) != shape:
             raise PluginError(
@@ -738,14 +743,6 @@ class Trainer:
                 f"{shape}, seeds and lanes first ({own.place_of(type(self.algorithm).act)})"
             )
         return actions.reshape(len(stacked), *shape[2:])
-
-    def _called(self) -> str:
-        """Name the parts called in an epoch; a generator that one call moves is blamed on that call, see `Fence`."""
-        entry = self.entry
-        return (
-            f"algorithm '{entry.algorithm.name}', or what it calls of model '{entry.model.name}' and environment "
-            f"'{entry.task.environment.name}'"
-        )
 
     def _require_scores(self, scores: Floats) -> None:
         """Refuse scores that no leaderboard would rank now, not after hours."""

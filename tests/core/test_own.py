@@ -22,7 +22,7 @@ from qrlsuite.results.records import EntryRecord, ProbeRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER, in_folder
-from qrlsuite.training.trainer import Trainer, first_network
+from qrlsuite.training.trainer import Trainer, first_network, require_trainable
 from tests.conftest import cases
 
 RING = '''
@@ -671,6 +671,7 @@ def test_a_mistake_in_a_users_file_is_one_line_that_names_its_place(
     own.load(write("mistakes.py", MISTAKES))
 
     def train() -> None:
+        require_trainable([resolve(task, entry)])
         trainer = Trainer(resolve(task, entry), [0])
         trainer.start()
         trainer.train_epoch()

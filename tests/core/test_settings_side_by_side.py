@@ -29,7 +29,7 @@ from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.store import EntryStore, read_lines
 from qrlsuite.specs import ModelSpec
 from qrlsuite.training import group
-from qrlsuite.training.trainer import Trainer
+from qrlsuite.training.trainer import Trainer, require_trainable
 from qrlsuite.tuning import search
 from qrlsuite.tuning.bayesian import Bayesian
 from qrlsuite.tuning.display import TuneDisplay
@@ -173,7 +173,10 @@ class Amplified(nn.Module):
         return self.gain * x @ self.weight
 
 
-def test_a_stack_of_agents_with_a_plain_number_each_is_refused(tiny_task: str) -> None:
+def test_a_stack_of_agents_with_a_plain_number_each_is_refused(
+    tiny_task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Entry, "third_party", lambda self: ["acme"])
     model = ModelSpec(
         "amplified",
         "Plain number",
@@ -182,9 +185,8 @@ def test_a_stack_of_agents_with_a_plain_number_each_is_refused(tiny_task: str) -
         f"{__name__}:Amplified",
     )
     chosen = [dataclasses.replace(entry, model=model) for entry in entries(tiny_task)]
-    Trainer(chosen[0], [0, 1])
     with pytest.raises(PluginError, match=r"model 'amplified': self\.gain differs"):
-        Trainer(chosen, [0, 0, 0])
+        require_trainable(chosen)
 
 
 def test_options_per_agent_become_tensors() -> None:

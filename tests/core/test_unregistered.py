@@ -16,12 +16,14 @@ from torch import Tensor, nn
 
 from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.registry import Registered
 from qrlsuite.results.checkpoint import group_id
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import ModelSpec
 from qrlsuite.training import unregistered
+from tests.commands import say
 from tests.conftest import Train, results
 
 
@@ -222,14 +224,14 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Base]], ModelSpec
 
 
 @pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
-@pytest.mark.parametrize("seeds", [(1,), (0, 1)], ids=["alone", "together"])
 def test_run_refuses_it_before_training(
-    cls: type[Base], seeds: tuple[int, ...], install: Callable[..., Any], train: Train, tmp_path: Path
+    cls: type[Base], install: Callable[..., Any], tiny_task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(cls)
+    monkeypatch.setattr(Entry, "third_party", lambda self: ["acme"])
     with pytest.raises(PluginError, match=REFUSED[cls]):
-        train("runs", seeds, model="acme", settings=())
-    assert not list(tmp_path.rglob("epochs.jsonl"))
+        say("run", "acme", "--task", tiny_task)
+    assert not list(Path(tiny_task).parent.rglob("epochs.jsonl"))
 
 
 def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: Train) -> None:

@@ -30,7 +30,7 @@ def register_environments(register):
                                        entry_point=f"bad_plugins:{{name.title().replace('_', '')}}"))
 """
 
-PROBE, FENCE, HIDDEN = "the probe", "it moved", "is changed by a forward pass"
+PROBE, HIDDEN = "the probe", "is changed by a forward pass"
 
 MODELS: dict[str, str | None] = {
     "good": None,
@@ -41,14 +41,14 @@ MODELS: dict[str, str | None] = {
     "urandom_in_forward": PROBE,
     "cache_by_shape": PROBE,
     "plain_integer": PROBE,
-    "torch_in_forward": FENCE,
+    "torch_in_forward": PROBE,
     "recurrent_buffer": HIDDEN,
 }
 ENVIRONMENTS: dict[str, str | None] = {
     "hop": None,
     "lanes_share_a_list": PROBE,
     "environment_counter": PROBE,
-    "numpy_in_reset": FENCE,
+    "numpy_in_reset": PROBE,
 }
 """What `run` says of each, None where it trains: a number that `build` draws follows from the seed."""
 
@@ -58,11 +58,14 @@ from pathlib import Path
 from qrlsuite.engine.probe import pack, train
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.training.trainer import require_trainable
 out, seeds, cases = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 for name, (task, model) in cases.items():
     header, arrays = {"error": None}, {}
     try:
-        side = train(resolve(task, model), seeds, 2)
+        entry = resolve(task, model)
+        side = train(entry, seeds, 2)
+        require_trainable([entry])  # before, and in another process
         header, arrays = {**header, "lines": side.lines}, side.arrays
     except QrlSuiteError as error:
         header["error"] = str(error)
