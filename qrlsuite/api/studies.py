@@ -289,8 +289,9 @@ def train_studies(
     """
     console = Console(stderr=True, quiet=not progress, highlight=False, soft_wrap=True, markup=False)
     missing.check_budget(budget, where)
-    works, began = [work for each in every for work in each.works], time.monotonic()
-    missing.settle_codes(works[0].runs, [work.entry for work in works], where, quiet=not progress)
+    began = time.monotonic()
+    if works := [work for each in every for work in each.works]:
+        missing.settle_codes(works[0].runs, [work.entry for work in works], where, quiet=not progress)
     limit = seconds(budget, where.workers)
     for place, each in enumerate(every):
         if place and limit is not None and time.monotonic() - began >= limit:

@@ -253,6 +253,15 @@ def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
     assert not runs.exists()
 
 
+def test_a_study_without_entries_has_nothing_to_train(tmp_path: Path) -> None:
+    path = tmp_path / "empty.toml"
+    path.write_text('format_version = 1\nname = "empty"\nsummary = "None"\n[[pictures]]\nkind = "curves"\n')
+    assert answer("study", "run", str(path), "--runs", str(tmp_path))["entries"] == []
+    assert "nothing to train" in say("show", str(path)).stdout
+    with pytest.raises(OptionError, match="has no entry"):
+        say("plot", "curves", "--study", str(path))
+
+
 def test_only_keeps_words_of_labels_but_no_part_of_a_hash(widths: str) -> None:
     steps = answer("study", "run", widths, "--dry-run")["entries"]
     first = steps[0]["entry"]
