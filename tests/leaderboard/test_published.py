@@ -17,12 +17,14 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from qrlsuite import api, registry, specs
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard.boards import board, costs
@@ -377,17 +379,14 @@ def test_verification_is_no_run_that_trackers_hear_of(folder: Path, monkeypatch:
     assert heard == []
 
 
-def test_what_a_seed_was_made_with_names_device_and_every_plugin(
-    train: Train, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_seed_was_made_with_names_device_and_every_plugin(monkeypatch: pytest.MonkeyPatch) -> None:
     known = registry.load()
     named = {"environments": "beam6g", "algorithms": "ddqn", "ansatzes": "cx", "circuit_backends": "native"}
     packages = dict(zip(named, ("pluggy", "packaging", "pydantic", "pydantic_core")))
     for kind, name in named.items():
         of_kind = known.entries[specs.kind(kind)]
         monkeypatch.setitem(of_kind, name, dataclasses.replace(of_kind[name], distribution=packages[kind]))
-    folder = train("runs", [0], 1, model="vqc-native", settings=("qubits=2", "layers=1", "ansatz=cx"))
-    (made,) = EntryStore(folder).seed(0).record().provenance
+    made = provenance.of(resolve("beam6g", "ddqn vqc-native ansatz=cx"), torch.device("cpu"))
     assert set(packages.values()) <= made.versions.keys()
     assert made.device.content == {"kind": "cpu", "name": provenance.processor()}
 
