@@ -110,6 +110,12 @@ class Clock:
         return max(0.0, (epochs - epoch) * max(self.pace, elapsed) - elapsed)
 
 
+def turns(state: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many turns of a group have ended, and how many there are, where not all seeds are trained at once."""
+    number = max(1, int(state.get("turns") or 1))
+    return min(int(state.get("turn") or 0), number - 1), number
+
+
 class CostEstimate:
     """Estimates the remaining time: from a group's first rounds, and from whole epochs once two have ended."""
 
@@ -118,7 +124,12 @@ class CostEstimate:
         self.epochs = epochs
         self.workers = min(workers, max(1, len(groups)))
         self._clocks = {name: Clock(group.epoch) for name, group in self.groups.items()}
+        self._turns = dict.fromkeys(self.groups, 1)
         self._began = False
+
+    def _span(self, name: str) -> int:
+        """Return the number of epochs of each of a group's turns."""
+        return self.epochs - self.groups[name].epoch
 
     def remaining(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> float | None:
         """Return the seconds left on these workers, None before enough was measured."""
@@ -127,21 +138,25 @@ class CostEstimate:
             for clock in list(self._clocks.values())[: self.workers]:
                 clock.begun = now
         for name, state in snapshot.items():
-            self._clocks[name].look(state, now)
+            turn, self._turns[name] = turns(state)
+            epoch = int(state.get("epoch") or 0) + turn * self._span(name)
+            self._clocks[name].look({**state, "epoch": epoch} if state else state, now)
         timed = {name: clock for name, clock in self._clocks.items() if clock.pace is not None}
         if not timed:
             return None
         pace = statistics.mean(
-            (clock.pace or 0.0) / len(self.groups[name].seeds) for name, clock in timed.items()
+            (clock.pace or 0.0) * self._turns[name] / len(self.groups[name].seeds)
+            for name, clock in timed.items()
         )
         once = statistics.mean(clock.once for clock in timed.values())
         total, longest = 0.0, 0.0
         for name, group in self.groups.items():
             clock = self._clocks[name]
-            left = clock.left(self.epochs, now)
+            last = group.epoch + self._turns[name] * self._span(name)
+            left = clock.left(last, now)
             if left is None:  # it waits for a worker, or is at its first epochs
                 epoch = clock.marks[-1][0] if clock.marks else group.epoch
-                left = (self.epochs - epoch) * pace * len(group.seeds)
+                left = (last - epoch) * pace * len(group.seeds) / self._turns[name]
                 left += 0.0 if clock.begun is not None else once
             total += left
             longest = max(longest, left)
@@ -334,7 +349,9 @@ class RunDisplay:
             fraction = 0.0
             if state.get("phase") == "training" and state.get("total"):
                 fraction = 0.8 * float(state["done"]) / float(state["total"])
-            done += min(self.epochs, epoch + fraction) * len(group.seeds)
+            turn, number = turns(state)
+            part = min(self.epochs, epoch + fraction) - group.epoch + turn * (self.epochs - group.epoch)
+            done += (group.epoch + part / number) * len(group.seeds)
             completed += len(group.seeds) * (state.get("phase") == "finished")
             epochs.append(epoch)
             scores += state.get("seed_scores") or []

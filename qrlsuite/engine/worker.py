@@ -114,12 +114,14 @@ def train_group(
         most = len(seeds) * max(1, len(files))
         state.size, state.untried = min((file.size(most) for file in files.values()), default=most), True
         report(state, force=True)
-        for together in [piece for _, whole in sorted(parts.items()) for piece in divided(whole, state.size)]:
+        pieces = [piece for _, whole in sorted(parts.items()) for piece in divided(whole, state.size)]
+        for turn, together in enumerate(pieces):
             probe = probing.prepare(together, epochs, device)
             if probe is not None:
                 claims.append(probe.claim)
             run = GroupRun(together, epochs, device, report, held, probe)
             run.progress.size, run.progress.untried = state.size, state.untried
+            run.progress.turn, run.progress.turns = turn, len(pieces)
             if state.size < most:
                 run.progress.warnings.append(
                     f"{counted(state.size, 'seed')} at a time instead of {most}: with more, the process was killed "
@@ -161,6 +163,12 @@ def divided(parts: Sequence[Part], size: int) -> Iterator[list[Part]]:
 
 def _most_memory() -> int:
     """Return the most bytes that this process has had in memory."""
+    with contextlib.suppress(
+        OSError, ValueError, IndexError
+    ):  # `getrusage` on Linux counts a parent that forked
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024
 

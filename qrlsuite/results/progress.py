@@ -34,6 +34,10 @@ class Progress:
     """Seconds of the last epoch; None for a process's first epoch, which includes its start."""
     size: int = 0
     """Seeds that are trained at a time, 0 before that is known."""
+    turn: int = 0
+    """Groups that ended before, where fewer seeds are trained at a time; each begins at the first epoch."""
+    turns: int = 1
+    """Number of these groups."""
     untried: bool = False
     """Whether no epoch of so many seeds has ended here yet."""
     memory: int = 0

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.engine.display import CostEstimate, RunDisplay
+from qrlsuite.engine.display import Bar, CostEstimate, RunDisplay
 from qrlsuite.engine.missing import summarize
 from qrlsuite.engine.terminal import as_command
 from qrlsuite.engine.work import Missing
@@ -92,6 +92,26 @@ def test_a_short_first_epoch_is_no_measure() -> None:
     assert left(2, 76.0) == pytest.approx(8 * 6.0 - 4 + once + other)
     assert left(2, 82.0) == pytest.approx(8 * 10.0 - 10 + once + other), "an epoch is as long as it has taken"
     assert left(10, 120.0, "finished") == pytest.approx(once + 2 / 3 * 10 * 6.0, rel=0.1)
+
+
+def test_seeds_that_are_trained_later_count_in_the_time_that_is_left(
+    clock: list[float], entry: Entry, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two of four seeds are trained at a time, ten epochs of a second each; so the second half begins at epoch 0."""
+    group = SeedGroup((0, 1, 2, 3), 0)
+    display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(4), 10, groups=[group]), 1)
+    drawn: list[float] = []
+    display.bar = Bar(display.console)
+    display.bar.update = lambda done, *_: drawn.append(done)  # type: ignore[method-assign]
+    display.bar._cell = True
+    left = []
+    for turn, epoch in [(0, 1), (0, 2), (0, 10), (1, 0), (1, 5), (1, 10)]:
+        clock[0] = 1000.0 + 10 * turn + epoch
+        state = {"phase": "training", "epoch": epoch, "turn": turn, "turns": 2}
+        left.append(display.estimate.remaining({group.id: state}, clock[0]))
+        display.update({group.id: state})
+    assert left == [None, *map(pytest.approx, [18.0, 10.0, 10.0, 5.0, 0.0])]
+    assert drawn == [2.0, 4.0, 20.0, 20.0, 30.0, 40.0]
 
 
 def test_the_pace_is_that_of_the_later_half() -> None:

@@ -142,6 +142,15 @@ def test_a_group_begins_where_it_fits_beside_the_first(
     assert max(running for running, _ in seen) == most
 
 
+def test_the_memory_of_the_process_that_started_a_worker_is_not_the_workers() -> None:
+    ballast = b"\1" * (600 << 20)
+    code = "from qrlsuite.engine import worker; print(worker._most_memory())"
+    run = subprocess.run(
+        [sys.executable, "-c", code], preexec_fn=local._ignore_warnings, stdout=subprocess.PIPE, check=True
+    )
+    assert int(run.stdout) < len(ballast)
+
+
 def test_half_as_many_are_trained_at_a_time_after_a_kill_in_the_first_epoch(tmp_path: Path) -> None:
     file, state = ProgressFile(EntryStore(tmp_path), "g"), Progress(size=10, untried=True)
     assert file.size(10) == 10
