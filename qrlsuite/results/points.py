@@ -132,7 +132,7 @@ def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Po
     Parameters
     ----------
     metric:
-        Name of the score: a column of csv files (default: `score`), a scalar of TensorBoard or W&B (default: the first
+        Name of the score: a column of csv files (default: `score`), a scalar of TensorBoard (default: the first
         of `run_files.METRICS` in the file).
 
     Returns

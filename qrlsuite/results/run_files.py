@@ -1,4 +1,4 @@
-"""Files that hold the learning curve of one run: of Stable-Baselines3, TensorBoard and W&B.
+"""Files that hold the learning curve of one run: of Stable-Baselines3 and TensorBoard.
 
 No file is unpickled, and how much one may hold is bounded before it is read.
 """
@@ -11,10 +11,7 @@ import io
 import itertools
 import json
 import math
-import os
 import shlex
-import subprocess
-import sys
 import zipfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -40,12 +37,11 @@ WINDOW = 100
 """Episodes over which training returns are averaged, as Stable-Baselines3 does (`stats_window_size`)."""
 
 _LONGEST_LINE = 1_000_000
-_NOT_FINITE = ("NaN", "Infinity", "-Infinity")
 
 _STEPS = "time/total_timesteps"
 """The column of steps in the `progress.csv` of Stable-Baselines3's logger."""
 
-_CURVES = "evaluations.npz", "*monitor.csv", "*.tfevents.*", "*.wandb", "*.csv"
+_CURVES = "evaluations.npz", "*monitor.csv", "*.tfevents.*", "*.csv"
 _MOST_PATHS = 100_000
 
 Curve = Iterable[tuple[int, float]]
@@ -80,14 +76,14 @@ def holds_one_run(path: Path) -> bool:
         size = path.stat().st_size
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
-    if size > MOST_BYTES and not _streamed(path):
+    if size > MOST_BYTES and _kind(path) is not _tensorboard:  # which is read bit by bit
         raise FileError(f"{path}: larger than {MOST_BYTES // 10**6} MB")
     if _kind(path) is not None:
         return True
     if not path.name.endswith(".csv"):
         raise FileError(
             f"{path}: give a csv file with the columns entry,seed,step,score; evaluations.npz, monitor.csv or "
-            "progress.csv of Stable-Baselines3; events.out.tfevents.* of TensorBoard; or run-*.wandb of W&B"
+            "progress.csv of Stable-Baselines3; or events.out.tfevents.* of TensorBoard"
         )
     return False
 
@@ -95,11 +91,8 @@ def holds_one_run(path: Path) -> bool:
 def words(path: Path) -> tuple[str, ...]:
     """Return the words that name the run of a file: words that may name its entry, and last the run's own name.
 
-    The words are the folders of the path. The last folder names the run, unless the file itself does. W&B's files state
-    project, group and name, and may have the seed in their configuration.
+    The words are the folders of the path. The last folder names the run, unless the file itself does.
     """
-    if _kind(path) is _wandb:
-        return _words_of_wandb(path)
     place = path.absolute()
     named_by_itself = _kind(path) is _evaluations and path.name != "evaluations.npz"
     run = place.with_suffix("") if named_by_itself else place.parent
@@ -112,7 +105,7 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
     Parameters
     ----------
     metric:
-        The scalar of TensorBoard, W&B or progress.csv that is the score.
+        The scalar of TensorBoard or progress.csv that is the score.
     """
     kinds = {_kind(path) for path in paths}
     reader = _kind(paths[0])
@@ -129,18 +122,11 @@ def _kind(path: Path) -> Callable[[Sequence[Path], str | None], Curve] | None:
     name = path.name
     if ".tfevents." in name:
         return _tensorboard
-    if name.endswith(".wandb"):
-        return _wandb
     if name.endswith(".npz"):
         return _evaluations
     if name == "progress.csv" and _STEPS in next(lines_of(path), ""):
         return _progress
     return _monitor if name == "monitor.csv" or name.endswith(".monitor.csv") else None
-
-
-def _streamed(path: Path) -> bool:
-    """Return whether a file is read bit by bit, and may have any length."""
-    return _kind(path) in (_tensorboard, _wandb)
 
 
 def whole(value: Any) -> int:
@@ -282,7 +268,8 @@ def _require_size(stream: io.BytesIO, length: int, source: str) -> None:
 
 def _tensorboard(paths: Sequence[Path], metric: str | None) -> Curve:
     """Return a scalar of event files; the last written value of a step counts."""
-    _require_installed("tensorboard", paths[0])
+    if importlib.util.find_spec("tensorboard") is None:
+        raise FileError(f"{paths[0]}: to read it, pip install 'qrlsuite[tensorboard]'")
     found: dict[str, dict[int, float]] = {}
     for path in sorted(paths, key=lambda path: path.name):
         try:
@@ -308,52 +295,6 @@ def _scalars(path: Path) -> Iterator[tuple[str, int, float]]:
                 yield value.tag, int(event.step), float(make_ndarray(value.tensor).item())
 
 
-def _wandb(paths: Sequence[Path], metric: str | None) -> Curve:
-    """Return a scalar of offline files of W&B, by `global_step` where a run logs it, else by W&B's own step."""
-    found: dict[str, dict[int, float]] = {}
-    for path in paths:
-        for record in _wandb_records(path):
-            history = _mapping(record.get("history"))
-            item = _mapping(history.get("item"))
-            step = item.get("global_step", _mapping(history.get("step")).get("num"))
-            for name, value in item.items():
-                number = float(value) if value in _NOT_FINITE else value  # as W&B writes them
-                if type(number) in (int, float) and type(step) in (int, float) and not name.startswith("_"):
-                    _collect(found, name, whole(step), float(number), metric, path)
-    return _chosen(found, metric, paths[0])
-
-
-def _mapping(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def _words_of_wandb(path: Path) -> tuple[str, ...]:
-    for record in _wandb_records(path):
-        if run := _mapping(record.get("run")):
-            above = [str(run[name]) for name in ("project", "run_group") if run.get(name)]
-            name = str(run.get("display_name") or path.absolute().parent.name)
-            seed = _mapping(_mapping(run.get("config")).get("update")).get("seed")
-            return (*above, name if seed is None else f"seed-{seed}")
-    raise FileError(f"{path}: not a run of W&B, or W&B cannot read it")
-
-
-def _wandb_records(path: Path) -> Iterator[Mapping[str, Any]]:
-    """Yield the records of a file, as W&B's own program prints them."""
-    _require_installed("wandb", path)
-    command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", str(path.absolute())]
-    env = {**os.environ, "WANDB_ERROR_REPORTING": "false", "WANDB_MODE": "offline"}
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, env=env, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet) as process:
-        assert process.stdout is not None  # it is a pipe
-        try:
-            while line := process.stdout.readline(_LONGEST_LINE):
-                yield _mapping(json.loads(line))
-        except (ValueError, RecursionError):
-            raise FileError(f"{path}: W&B does not print it as JSON records") from None
-        finally:
-            process.kill()
-
-
 def _collect(
     found: dict[str, dict[int, float]], name: str, step: int, value: float, metric: str | None, path: Path
 ) -> None:
@@ -372,8 +313,3 @@ def _chosen(found: Mapping[str, Mapping[int, float]], metric: str | None, path: 
         here = listed([ascii(each)[1:-1][:60] for each in sorted(found)]) or "none"
         raise FileError(f"{path}: name the scalar that is the score with metric=NAME; found {here}")
     return sorted(found[name].items())
-
-
-def _require_installed(package: str, path: Path) -> None:
-    if importlib.util.find_spec(package) is None:
-        raise FileError(f"{path}: to read it, pip install 'qrlsuite[{package}]'")

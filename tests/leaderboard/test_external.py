@@ -347,33 +347,13 @@ def test_progress_files_are_told_by_their_columns(tmp_path: Path) -> None:
     assert list(points.read_files([path])) == [("mine", 1)], "a name alone says nothing"
 
 
-def test_offline_files_of_wandb(tmp_path: Path) -> None:
-    wandb = pytest.importorskip("wandb")
-    for seed in (0, 1):
-        run = wandb.init(
-            project="p", group="small", config={"seed": seed}, dir=tmp_path, mode="offline", reinit="finish_previous"
-        )  # fmt: skip
-        for step in (1, 2):
-            run.log({"eval/mean_reward": step + seed, "global_step": 100 * step})
-        run.finish()
-    files = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
-    found = points.read_files(files)
-    assert sorted(found) == [("small", 0), ("small", 1)]
-    assert found["small", 1].steps.tolist() == [100, 200]
-    assert found["small", 1].scores.tolist() == [2, 3]
-    (tmp_path / "damaged.wandb").write_bytes(files[0].read_bytes()[:10])
-    with pytest.raises(QrlSuiteError, match="not a run of W&B"):
-        points.read_files([tmp_path / "damaged.wandb"])
-
-
 def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    for name, package in (("seed-1/events.out.tfevents.1", "tensorboard"), ("run-1.wandb", "wandb")):
-        path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-        with pytest.raises(QrlSuiteError, match=rf"pip install 'qrlsuite\[{package}\]'"):
-            points.read_files([path])
+    path = tmp_path / "seed-1" / "events.out.tfevents.1"
+    path.parent.mkdir()
+    path.touch()
+    with pytest.raises(QrlSuiteError, match=r"pip install 'qrlsuite\[tensorboard\]'"):
+        points.read_files([path])
 
 
 def test_names_come_from_what_differs_between_paths(sb3: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def import_entries(
             metavar="PATH|OPTION=VALUE",
             help="Results folders, folders that `export` wrote, or entries' folders in them. Or files with the curves "
             "of other programs: csv (entry,seed,step,score), evaluations.npz, monitor.csv or progress.csv of "
-            "Stable-Baselines3, event files of TensorBoard, *.wandb. Options of files: maximum=BEST, the best "
+            "Stable-Baselines3, event files of TensorBoard. Options of files: maximum=BEST, the best "
             "possible score: scores become fractions of it; metric=NAME, the column or scalar that is the score; "
             "for a new task thresholds=A,B,..., scores that count as reached, goal=below where less is better, and "
             "every=STEPS between grid points.",
