@@ -167,8 +167,15 @@ def copy(source: Source, folder: Path) -> Path:
     place = folder / source.mark
 
     def is_there() -> bool:
-        found = {file.relative_to(place).as_posix(): file.read_bytes() for file in walk(place)}
-        return found == dict(source.files) and not any(path.is_symlink() for path in place.rglob("*"))
+        found: dict[str, bytes | None] = {}
+        for path in place.rglob("*"):
+            name = path.relative_to(place)
+            passed = any(part == "__pycache__" or part.startswith(".") for part in name.parts)
+            if path.is_symlink() and not passed:
+                found[name.as_posix()] = None
+            elif path.is_file() and (name.as_posix() in source.files or not passed):
+                found[name.as_posix()] = None if path.is_symlink() else path.read_bytes()
+        return found == dict(source.files)
 
     try:
         if not is_there():

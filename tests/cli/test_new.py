@@ -103,6 +103,14 @@ def test_a_package_of_a_file_registers_what_the_file_did(packages: Path) -> None
     ]
 
 
+def test_data_of_any_name_is_listed_in_toml(tmp_path: Path) -> None:
+    Path(tmp_path, 'w.n"x').write_text("1")
+    Path(tmp_path, "ring.py").write_text(f"files = ['w.n\"x']\n{RING}")
+    written = scaffold.package(tmp_path / "ring.py", None).files["pyproject.toml"]
+    project = tomllib.loads(written.decode())
+    assert project["tool"]["setuptools"]["package-data"] == {"ring": ['**/*.n"x', "py.typed"]}
+
+
 def test_its_code_is_checked_and_trained(packages: Path, tmp_path: Path) -> None:
     environment = installed(packages / "site")
     checked = start("check", "ansatz:ring", env=environment, cwd=packages / "site").communicate()[0]

@@ -502,8 +502,11 @@ def test_data_outside_of_the_files_folder_is_not_read(data: str) -> None:
 def test_data_is_named_by_its_place_however_it_is_written() -> None:
     write("here/w.txt", "x")
     Path("here/loop").symlink_to("loop")
-    text = "files = ['../here/w.txt', 'none/../w.txt']\ndef ring(qubits, layers): ...\n"
-    assert set(own.read(write("here/ring.py", text)).files) == {"ring.py", "w.txt"}
+    write("here/.hidden/w.txt", "x")
+    text = "files = ['../here/w.txt', 'none/../w.txt', '.hidden/w.txt']\n"
+    source = own.read(write("here/ring.py", text))
+    assert set(source.files) == {"ring.py", "w.txt", ".hidden/w.txt"}
+    assert source.copy.with_name(".hidden").joinpath("w.txt").read_text() == "x"
     for name in ("loop", "w\\0"):
         said = refusal(write("here/ring.py", f"files = ['{name}']\ndef ring(qubits, layers): ...\n"))
         assert "and there is no such file" in said
