@@ -1,13 +1,13 @@
 """Checking published entries: their files, and some of their seeds by training them again.
 
 Which seeds, is drawn after the files are read, from fresh entropy. Curves that come out bit for bit are `verified`,
-wherever they were trained. Where bits must be equal, one that is not is a failure; elsewhere the entry is `plausible`
-at best, see `qrlsuite.leaderboard.shelf.plausible`.
+wherever they were trained. Where bits must be equal, one that is not is a failure; elsewhere they are not compared.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,9 +21,8 @@ from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.files import read_bytes
-from qrlsuite.leaderboard.shelf import plausible, published
+from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.absent import absent
-from qrlsuite.leaderboard.shelf.curves import current
 from qrlsuite.leaderboard.shelf.fingerprint import CHUNK, fingerprint
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results import provenance, speed
@@ -42,7 +41,13 @@ EXECUTIONS = 0.1
 SAME = 1e-6
 """Two runs have not parted while their scores differ by less."""
 
-Check = Literal["files", "verified", "plausible", "repeated"]
+Check = Literal["files", "verified", "repeated"]
+
+POWER = 0.95
+"""Probability of finding a forgery, for which the number of seeds is chosen."""
+
+REPLACED = 0.1
+"""Share of forged seeds that is to be found with that probability."""
 Wanted = int | Literal["auto"]
 
 
@@ -53,7 +58,7 @@ class VerificationResult:
     Attributes
     ----------
     check:
-        The strongest statement: files alone, curves equal bit for bit (`verified`), or plausible curves. Equal bits of
+        The strongest statement: files and beginnings alone, or curves equal bit for bit (`verified`). Equal bits of
         seeds that an earlier draw named are `repeated`.
     seeds:
         The seeds that were trained again.
@@ -141,9 +146,8 @@ def verify(
 
     With `rerun`, seeds are drawn and trained again from nothing, on the CPU. Initial parameters, the first epoch's
     episodes and the score before training must agree to 1e-5; numbers of parameters and circuit executions must equal
-    the record. If versions and type of machine are equal, curves must be equal, bit for bit. Otherwise a differing
-    curve must begin like its seed's published curve, and the steps below the thresholds must be plausible
-    (`qrlsuite.leaderboard.shelf.plausible`).
+    the record. If versions and type of machine are equal, curves must be equal, bit for bit. Other curves that differ
+    are not compared.
 
     Parameters
     ----------
@@ -172,7 +176,7 @@ def verify(
     if changed := _changed_code(entry, made_by):
         return VerificationResult(folder, name, False, "files", (), changed, digest)
     number = secrets.randbelow(10**9) if choice is None else choice
-    places = _draw(number, digest, count, plausible.needed(count) if rerun == "auto" else min(rerun, count))
+    places = _draw(number, digest, count, needed(count) if rerun == "auto" else min(rerun, count))
     announce(f"{name}: {_cost(made_by, len(places), count, length)}")
     ok, check, message = _train_again(entry, made_by, places, report)
     if check == "verified" and choice is not None:
@@ -212,6 +216,30 @@ def _other_parameters(entry: PublishedEntry, counted: Sequence[Mapping[str, int]
     return f"its record has parameters {dict(stated)}, counted here: {dict(counted[0])}"
 
 
+def found_by(again: int, forged: int, seeds: int) -> float:
+    """Return the probability that at least one of `forged` seeds is among the `again` seeds that are trained again.
+
+    >>> round(found_by(25, 10, 100), 3)
+    0.952
+    """
+    return 1 - math.comb(seeds - forged, again) / math.comb(seeds, again)
+
+
+def forged_of(seeds: int) -> int:
+    """Return how many forged seeds are to be found: a tenth, and one at least."""
+    return max(1, round(REPLACED * seeds))
+
+
+def needed(seeds: int) -> int:
+    """Return how many seeds have to be trained again to find a tenth of them forged with probability .95.
+
+    >>> needed(100), needed(20)
+    (25, 16)
+    """
+    forged = forged_of(seeds)
+    return next(again for again in range(1, seeds + 1) if found_by(again, forged, seeds) >= POWER)
+
+
 def _digest(folder: Path) -> str:
     """Return a hash of an entry's files; the record has the hash of the agents."""
     paths = (folder / name for name in ("entry.json", published.CURVES, published.SEEDS))
@@ -234,10 +262,10 @@ def _cost(made_by: Entry, again: int, count: int, epochs: int) -> str:
 
 def _finds(again: int, count: int) -> str:
     """Return the probability that this many seeds find a forgery, in words."""
-    forged = plausible.forged_of(count)
+    forged = forged_of(count)
     return (
         f"if {forged} of {count} were forged, it would be found with probability "
-        f"{plausible.found_by(again, forged, count):.2f}"
+        f"{found_by(again, forged, count):.2f}"
     )
 
 
@@ -246,11 +274,11 @@ def _train_again(
 ) -> tuple[bool, Check, str]:
     """Return whether the retrained seeds fit the entry, the strongest statement, and both in words."""
     if problem := _beginning(entry, made_by, places):
-        return False, "plausible", problem
+        return False, "files", problem
     again = retrain(entry, places, report)
     equal = (again.curves == entry.curves[places]).all(axis=1)
     if problem := _counts(entry, again, places, equal):
-        return False, "plausible", problem
+        return False, "files", problem
     elsewhere = {int(entry.origins[place]): _elsewhere(entry, made_by, [place]) for place in places}
     for row, place in enumerate(places):
         if not equal[row] and elsewhere[entry.origins[place]] is None:
@@ -274,11 +302,10 @@ def _train_again(
         found = f"curves equal, bit for bit; {_finds(trained, count)}"
         return True, "verified", f"{begun}: {found}; not compared: {left}"
     differs = next(text for text in elsewhere.values() if text is not None)
-    ok, found = _plausible(entry, again.curves, places)
     apart = np.abs(again.curves - entry.curves[places]) > SAME
     parts = int(np.median(np.where(apart.any(axis=1), apart.argmax(axis=1), apart.shape[1])))
     begun += f", {int(equal.sum())} of them equal, bit for bit ({differs}), half alike for {parts} epochs"
-    return ok, "plausible", f"{begun}; {found}; not compared: bits of {int((~equal).sum())} seeds, {left}"
+    return True, "files", f"{begun}; not compared: bits of {int((~equal).sum())} seeds, {left}"
 
 
 def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
@@ -465,35 +492,6 @@ def _other_metric(entry: PublishedEntry, place: int, again: Mapping[str, NDArray
 def _equal(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
     """Return whether two agents have equal parameters, bit for bit."""
     return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
-
-
-def _plausible(entry: PublishedEntry, again: NDArray[np.float64], places: list[int]) -> tuple[bool, str]:
-    """Return whether curves of another machine may belong to the entry, and the tests with their power."""
-    count, first = len(entry.seeds), plausible.FIRST
-    unlike = plausible.strangers(again, entry.curves, places)
-    made = (origin for place in places for origin in entry.provenance[place].with_earlier)
-    if len(unlike) > plausible.tolerated(len(places), any(origin.device.kind != "cpu" for origin in made)):
-        numbers = ", ".join(str(entry.seeds[places[row]]) for row in unlike)
-        return (
-            False,
-            f"seed {numbers}: the first {first} epochs are not its own, other seeds' curves are nearer",
-        )
-    steps, grid = entry.task_file.protocol.interactions, current(entry.record).ranking.grid
-
-    def times(curves: NDArray[np.float64]) -> NDArray[np.float64]:
-        return plausible.per_run(curves, grid, steps)
-
-    here, there = times(again), times(entry.curves)
-    paired = plausible.paired_p(there[places] - here)
-    ranked = plausible.rank_p(here, np.delete(there, places))
-    ok = min(paired, ranked) > plausible.FALSE_ALARM / 2
-    found = plausible.power(entry.curves, again, places, times)
-    return ok, (
-        f"{len(places) - len(unlike)} begin as published ({_finds(len(places), count)}, if they do not); "
-        f"steps below the thresholds {'plausible' if ok else 'not plausible'}: {here.mean():,.0f} here, "
-        f"{there[places].mean():,.0f} published (paired p = {paired:.2g}, among all p = {ranked:.2g}; "
-        f"curves 10 percent faster are found with probability {found:.2f})"
-    )
 
 
 def _list(seeds: Sequence[int]) -> str:

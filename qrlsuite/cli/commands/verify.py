@@ -47,9 +47,8 @@ def verify(
     Files: hashes, names and labels are computed again; every seed must have every epoch, and scores in range.
     With --rerun, seeds of each entry are drawn after its files are read, and trained from nothing; the cost is printed
     first. An entry is `verified` if all curves come out bit for bit. A curve that differs is a failure on the same
-    type of machine with the same versions. Elsewhere an entry can be `plausible`: every seed begins as published, and
-    its steps below the thresholds fit; the report says how likely forgeries would have been found. Parameters and
-    circuit executions are counted again. Reports of one digest belong together: one failure among them stands. Exit
+    type of machine with the same versions. Elsewhere it is not compared beyond its beginning. Parameters and circuit
+    executions are counted again. Reports of one digest belong together: one failure among them stands. Exit
     code 1 if an entry fails.
 
     With --base REV, the command checks the entries and studies of the repository around this folder, below
