@@ -48,8 +48,10 @@ class Algorithm(Protocol):
     populations of `build_model` standardize their inputs, by statistics that stand still during an epoch
     (`qrlsuite.training.standardization`).
 
-    The class of its options may have a method `unusable(epochs, rounds, environments)`: a list of sentences on
-    settings that are of no use in a run of so many epochs, each of so many steps of every environment of a seed.
+    The class of its options may have a class variable `starting_values`: values of options that a task's preset leaves
+    out, and those of the quick look `--task gym:ID`. It may have a method `unusable(epochs, rounds, environments)`: a
+    list of sentences on settings that are of no use in a run of so many epochs, each of so many steps of every
+    environment of a seed.
     """
 
     def start(self) -> None:

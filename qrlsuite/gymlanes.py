@@ -430,16 +430,6 @@ def _supported(
     return action, observation, spaces.Box(limits[0], limits[1], dtype=np.float32)
 
 
-QUICK_DDQN: dict[str, Any] = {
-    "gamma": 0.99,
-    "lr": 2.5e-4,
-    "buffer": 10_000,
-    "batch": 128,
-    "target_steps": 50,
-}
-"""Settings of CleanRL's dqn.py (commit 020cf0e), whose target is copied every 500 steps: 50 gradient steps here."""
-
-
 def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     """Return the content of a task file for a quick look at a Gymnasium environment, `--task gym:ID`.
 
@@ -448,7 +438,7 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     T - |T|/2, T - |T|/4 and T, the last one shown first. Where Gymnasium knows none, the one threshold is 0:
     a task file is needed to define a good return. A threshold that random actions reach in each of 10 episodes
     tells nothing apart, and is left out; where none is left, the highest of these returns is the threshold. The
-    summary says so. Without a time limit, episodes are cut at 1000 steps. DDQN has `QUICK_DDQN`.
+    summary says so. Without a time limit, episodes are cut at 1000 steps. Algorithms have their `starting_values`.
 
     Parameters
     ----------
@@ -509,8 +499,19 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
             "reference": {"threshold": thresholds[-1], "delta": 0.5},
             "horizons": [100_000],
         },
-        **({"presets": {"default": {"ddqn": {"all": QUICK_DDQN}}}} if kind == "discrete" else {}),
+        **({"presets": {"default": presets}} if (presets := _starting_values(kind)) else {}),
     }
+
+
+def _starting_values(kind: str) -> dict[str, Any]:
+    """Return the starting values of the algorithms that take actions of a kind, as a preset."""
+    algorithms = (each.spec for each in registry.load().of(specs.AlgorithmSpec).values())
+    values = {
+        each.name: getattr(specs.resolve(each.options), "starting_values", {})
+        for each in algorithms
+        if kind in each.actions
+    }
+    return {name: {"all": dict(given)} for name, given in values.items() if given}
 
 
 def _algorithm(kind: str) -> str:

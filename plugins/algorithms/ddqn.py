@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -42,6 +42,16 @@ from qrlsuite.seeding import Streams
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class DDQNOptions:
     """Options of double deep Q-learning; the defaults are the released settings."""
+
+    starting_values: ClassVar[Mapping[str, Any]] = {
+        "gamma": 0.99,
+        "lr": 2.5e-4,
+        "buffer": 10_000,
+        "batch": 128,
+        "target_steps": 50,
+    }
+    """For a task of one's own: CleanRL's dqn.py (commit 020cf0e) copies its target every 500 steps, 50 gradient steps
+    here."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.95
     lr: Annotated[

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
 from qrlsuite import options, registry, specs
-from qrlsuite.experiment.task import is_quick, load
+from qrlsuite.experiment.task import is_quick, load, starting_values
 
 
 def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
@@ -54,7 +55,29 @@ def _source(environment: str) -> str:
 def _task(name: str) -> dict[str, Any]:
     """Return a task's hash and file."""
     task = load(name)
-    return {"hash": task.hash, **task.file.model_dump(mode="json", exclude={"name"})}
+    left_out = {
+        preset: {
+            algorithm: values
+            for algorithm, families in by_algorithm.items()
+            if (values := _left_out(algorithm, families))
+        }
+        for preset, by_algorithm in task.file.presets.items()
+    }
+    added = {preset: values for preset, values in left_out.items() if values}
+    return {
+        "hash": task.hash,
+        **task.file.model_dump(mode="json", exclude={"name"}),
+        **({"starting_values": added} if added else {}),
+    }
+
+
+def _left_out(algorithm: str, families: Mapping[Any, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the algorithm's starting values that a preset does not set for all models."""
+    return {
+        option: value
+        for option, value in starting_values(algorithm).items()
+        if option not in families.get("all", {})
+    }
 
 
 def _set_with(spec: specs.Spec) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -395,8 +396,8 @@ class Task:
     def preset(self, name: str | None, algorithm: str, family: str) -> tuple[str | None, dict[str, Any]]:
         """Return the chosen preset's name and its values for an algorithm and a model family.
 
-        If the default preset has no values for them, there is no preset: the algorithm's defaults are not a task's
-        `tuned` settings.
+        Options that a preset leaves out have the algorithm's `starting_values`. If the default preset has no values for
+        them, there is no preset: the algorithm's defaults are not a task's `tuned` settings.
         """
         chosen = name or self.file.default_preset
         if chosen is None:
@@ -407,7 +408,11 @@ class Task:
             )
         tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
         if tables.keys() & {"all", family}:
-            return chosen, {**tables.get("all", {}), **tables.get(family, {})}
+            return chosen, {
+                **starting_values(algorithm),
+                **tables.get("all", {}),
+                **tables.get(family, {}),
+            }
         if name is None:
             return None, {}
         of = f" with {family} models" if tables else ""
@@ -435,6 +440,13 @@ class Task:
                     problems.append(str(error))
         if problems:
             raise FileError(f"{self.source}: " + "; ".join(dict.fromkeys(problems)))
+
+
+def starting_values(algorithm: str) -> Mapping[str, Any]:
+    """Return an algorithm's values for options that a task's preset leaves out; by default none."""
+    registered = registry.load().of(specs.AlgorithmSpec)
+    cls = specs.resolve(registered[algorithm].spec.options) if algorithm in registered else None
+    return getattr(cls, "starting_values", {})
 
 
 def digest(content: Any) -> str:

@@ -103,12 +103,14 @@ def test_a_preset_that_says_nothing_of_an_algorithm_is_not_its_preset() -> None:
     presets = "[presets.tuned.ppo.quantum]\nlr = 0.1\n[presets.tuned.ddqn.all]\nlr = 0.2\n"
     text = TINY.replace("[environment]", 'default_preset = "tuned"\n[environment]', 1) + presets
     read = task.parse(text, "t.toml")
-    assert read.preset(None, "ddqn", "classical") == ("tuned", {"lr": 0.2})
+    field = task.starting_values("ddqn")  # of options that the preset leaves out
+    assert field["target_steps"] == 50
+    assert read.preset(None, "ddqn", "classical") == ("tuned", {**field, "lr": 0.2})
     assert read.preset(None, "ppo", "quantum") == ("tuned", {"lr": 0.1})
     assert read.preset(None, "ppo", "classical") == (None, {})
     assert read.preset(None, "mine", "classical") == (None, {})
     named = task.parse(TINY + presets.replace("tuned", "default"), "t.toml")
-    assert named.preset(None, "ddqn", "classical") == ("default", {"lr": 0.2}), (
+    assert named.preset(None, "ddqn", "classical") == ("default", {**field, "lr": 0.2}), (
         "chosen where the file names none"
     )
     with pytest.raises(
