@@ -218,7 +218,10 @@ def read(path: str | os.PathLike[str]) -> Source:
         raise PluginError(
             f"plugin {shown}: Python cannot import a module '{name}': rename it, for example {usable}"
         )
-    return Source(place, files)
+    source = Source(place, files)
+    if _is_copy(str(place)) and source.mark != place.parent.name:
+        raise PluginError(f"plugin {shown} is a copy, and not what it was: give the plugin itself")
+    return source
 
 
 def _no_plugin(shown: str, place: Path) -> str:

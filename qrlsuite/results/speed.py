@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from qrlsuite.errors import StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore
 
 SAMPLED_SEEDS = 8
@@ -40,10 +42,11 @@ class Speed:
 
 
 def find(entry: Entry, together: int | None, *runs: Path) -> Speed | None:
-    """Return an entry's speed in groups of `together` seeds, from the first results folder that knows it."""
+    """Return an entry's speed in groups of `together` seeds, from the first results folder that knows its code's."""
+    code = identity.of(entry)
     for folder in runs:
         with contextlib.suppress(StoreError):  # a damaged entry tells nothing
-            if (speed := measure(EntryStore.find(folder, entry), together)) is not None:
+            if (speed := measure(codes.place(folder, entry, code), together)) is not None:
                 return speed
     return None
 

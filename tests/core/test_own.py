@@ -537,6 +537,11 @@ def test_a_copy_that_was_changed_is_written_anew() -> None:
     assert own.load("ring.py").source.copy.read_text() == RING
     assert not made.source.copy.with_name("math.py").exists()
     own.unload(made)
+    again = own.load(made.source.copy)  # as the probe's process does
+    assert again.source.mark == made.source.mark
+    own.unload(again)
+    made.source.copy.write_text("raise SystemExit\n")
+    assert "is a copy, and not what it was" in refusal(str(made.source.copy))
     made.source.copy.with_name("math.py").symlink_to(write("math.py", "raise SystemExit\n"))
     own.load("ring.py")
     assert not made.source.copy.with_name("math.py").is_symlink()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from qrlsuite.experiment import identity
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed
 from qrlsuite.results.store import EntryStore
@@ -48,3 +49,13 @@ def test_the_median_of_an_entrys_epochs_is_measured(train: Train, tmp_path: Path
     assert (many.low, many.high) == pytest.approx((1.05 / within, 2 * 1.05 * within))
     write(1)
     assert speed.measure(store) is None, "one epoch tells nothing"
+
+
+def test_what_other_code_took_is_no_measure(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = EntryStore(train("runs", [0], 3)).entry()
+    assert speed.find(entry, None, tmp_path / "runs") is not None
+    other = identity.CodeIdentity(({"role": "model", "name": "mlp", "distribution": "x"},))
+    monkeypatch.setattr(identity, "of", lambda entry: other)
+    assert speed.find(entry, None, tmp_path / "runs") is None
