@@ -45,6 +45,7 @@ from typing import Any, TypeVar
 import qrlsuite
 from qrlsuite import hookspecs, registry, shortforms, specs
 from qrlsuite.errors import FileError, OptionError, PluginError, QrlSuiteError, listed
+from qrlsuite.files import read_bytes
 from qrlsuite.registry import Plugin, Registered, Registry
 
 MOST_BYTES, MOST_FILES = 16 << 20, 500
@@ -354,7 +355,7 @@ def _bytes(shown: str, path: Path) -> bytes:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise PluginError(f"plugin {shown}: {path.name} is larger than {MOST_BYTES >> 20} MB")
-        return path.read_bytes()
+        return read_bytes(path)
     except OSError as error:
         missing = isinstance(error, FileNotFoundError)
         raise PluginError(

@@ -547,6 +547,13 @@ def test_a_copy_that_was_changed_is_written_anew() -> None:
     assert not made.source.copy.with_name("math.py").is_symlink()
 
 
+def test_a_pipe_or_device_is_no_plugin() -> None:
+    os.mkfifo("pipe.py")
+    assert "plugin pipe.py cannot be read: not a regular file" in refusal("pipe.py")
+    Path("zero.py").symlink_to("/dev/zero")
+    assert "plugin zero.py cannot be read: not a regular file" in refusal("zero.py")
+
+
 def test_bytecode_beside_a_copy_does_not_run() -> None:
     made = own.load(write("ring.py", RING))
     own.unload(made)
