@@ -179,8 +179,8 @@ def train_entry(
 
         entry, put_agents = begin_with(entry, folder, start, seed_numbers)
     missing.check_budget(budget, where)
-    missing.settle_codes(folder, [entry], where, quiet)
-    work = missing.find(folder, entry, where, seed_numbers, epochs)
+    (code,) = missing.settle_codes(folder, [entry], where, quiet)
+    work = missing.find(folder, entry, where, seed_numbers, epochs, code)
     if put_agents is not None:
         put_agents(work.store)
     if work.groups:

@@ -20,6 +20,7 @@ from qrlsuite.engine.work import EngineOutcome, Missing, Snapshot, raise_failure
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import checkpoint, codes, probes, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
@@ -36,6 +37,7 @@ def find(
     where: Where,
     seeds: Sequence[int] | None = None,
     epochs: int | None = None,
+    code: CodeIdentity | None = None,
 ) -> Missing:
     """Find an entry's missing seeds in a results folder; writes nothing.
 
@@ -43,10 +45,12 @@ def find(
     ----------
     seeds, epochs:
         None takes the task's protocol.
+    code:
+        As `settle_codes` returned it; None computes it.
     """
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
-    code = identity.of(entry)
+    code = code or identity.of(entry)
     store = codes.place(runs, entry, code)
     busy = {seed for claim in certain(store) for seed in claim.seeds} | where.engine.queued(store)
     busy &= set(requested)
@@ -55,8 +59,10 @@ def find(
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing, code)
 
 
-def settle_codes(runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False) -> None:
-    """Say of which entries earlier seeds are of another code, unless `quiet`, before anything is planned.
+def settle_codes(
+    runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False
+) -> list[CodeIdentity]:
+    """Return the code of each entry; say of which ones earlier seeds are of another code, unless `quiet`.
 
     A study with looks is refused then. With `where.same`, the codes are linked, once a checkpoint was loaded.
     """
@@ -65,9 +71,8 @@ def settle_codes(runs: Path, entries: Sequence[Entry], where: Where, quiet: bool
         raise OptionError(
             "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
         )
-    anew = []
-    for entry in entries:
-        code = identity.of(entry)
+    anew, found = [], [identity.of(entry) for entry in entries]
+    for entry, code in zip(entries, found):
         store = codes.place(runs, entry, code)
         before = codes.other(runs, entry, code)
         if before is not None and reason is not None:
@@ -88,6 +93,7 @@ def settle_codes(runs: Path, entries: Sequence[Entry], where: Where, quiet: bool
         more = f" (and so for {counted(len(anew) - 1, 'more entry')})" if len(anew) > 1 else ""
         console = Console(stderr=True, quiet=quiet, highlight=False)
         console.print(f"{anew[0]}{more}", markup=False, soft_wrap=True)
+    return found
 
 
 def prepare(work: Missing) -> None:

@@ -37,7 +37,7 @@ RULES = {
         "builds", "trains", "interactions", "acts", "learns", "same seed", "different seed",
         "state is seed-first", "seed independence", "options per agent", "state",
     ],
-    "tasks": ["file", "format", "says what is registered", "identity", "algorithms", "ranking", "scores"],
+    "tasks": ["file", "format", "says what is registered", "identity", "algorithms", "settings", "ranking", "scores"],
 }  # fmt: skip
 """Rules of each kind that has some, after those that all have in common."""
 
