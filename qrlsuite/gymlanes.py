@@ -516,8 +516,8 @@ def _starting_values(kind: str) -> dict[str, Any]:
 
 def _algorithm(kind: str) -> str:
     """Return the first registered algorithm that takes actions of a kind; any where none does, and training says so."""
-    known = registry.load()
-    names = known.names(specs.AlgorithmSpec)
+    registered = registry.load()
+    names = registered.names(specs.AlgorithmSpec)
     return next((name for name in names if kind in registry.get(specs.AlgorithmSpec, name).actions), names[0])
 
 

@@ -339,11 +339,11 @@ def _declared(tree: ast.Module) -> Iterator[str]:
 
 def _installed() -> set[str]:
     """Return the top-level modules of installed plugins, the suite's own among them."""
-    known = registry.load()
+    registered = registry.load()
     return {
         each.module.partition(":")[0].partition(".")[0]
-        for each in known.plugins
-        if each.distribution not in known.by_path
+        for each in registered.plugins
+        if each.distribution not in registered.by_path
     }
 
 
@@ -411,7 +411,7 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
 
 def load_source(source: Source) -> Loaded:
     """Like `load`, with content that was read before."""
-    known = registry.load()
+    registered = registry.load()
     before: Loaded | None = next((each for each in loaded() if each.source.module == source.module), None)
     if before is None:
         _require_free(source)
@@ -425,12 +425,12 @@ def load_source(source: Source) -> Loaded:
     if before is not None:
         unload(before)
     try:
-        made = _load(known, source)
+        made = _load(registered, source)
     except BaseException:
         if before is not None:
-            _load(known, before.source)
+            _load(registered, before.source)
         raise
-    known.announce(made.sentence)
+    registered.announce(made.sentence)
     return made
 
 
@@ -528,12 +528,12 @@ def _place(thing: Any) -> str:
     return f"{sys.modules[thing.__module__].__file__}" + (f":{line}" if line else "")
 
 
-def _require_unique(known: Registry, new: Sequence[Registered[Any]]) -> None:
+def _require_unique(registered: Registry, new: Sequence[Registered[Any]]) -> None:
     """Refuse a name that something else has, or that a plugin registers twice."""
     seen: dict[tuple[type[specs.Spec], str], Registered[Any]] = {}
     for each in new:
         key = type(each.spec), each.spec.name
-        other = known.of(key[0]).get(key[1]) or seen.get(key)
+        other = registered.of(key[0]).get(key[1]) or seen.get(key)
         if other is not None:
             raise PluginError(
                 f"{each.place}: {each.spec.title} is registered already, by {other.distribution} ({other.place}): give "

@@ -10,7 +10,7 @@ def absent(entry: EntryResults) -> list[str]:
     """Name the parts that an entry needs for further training and nothing registers: `model 'fourier'`."""
     if entry.external:
         return []
-    known = registry.load()
+    registered = registry.load()
     used: list[tuple[type[specs.Spec], str]] = [
         (specs.EnvironmentSpec, entry.task_file.environment.name),
         (specs.AlgorithmSpec, entry.algorithm),
@@ -20,4 +20,4 @@ def absent(entry: EntryResults) -> list[str]:
     options = entry.identity.get("model_options", {})
     if isinstance(options, dict):
         used += [(s, options[s.kind]) for s in specs.KINDS.values() if isinstance(options.get(s.kind), str)]
-    return [specs.title(kind, name) for kind, name in used if name not in known.of(kind)]
+    return [specs.title(kind, name) for kind, name in used if name not in registered.of(kind)]

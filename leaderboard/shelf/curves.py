@@ -542,8 +542,8 @@ def registered_task(name: str) -> Task | None:
 
 
 @functools.lru_cache(maxsize=256)
-def _registered(known: registry.Registry, name: str) -> Task | None:
-    if name not in known.of(specs.TaskSpec):
+def _registered(registered: registry.Registry, name: str) -> Task | None:
+    if name not in registered.of(specs.TaskSpec):
         return None
     try:
         return load_task(name)

@@ -80,8 +80,8 @@ def describe(
     among = [] if kind == PICTURE else [specs.kind(kind)] if kind else list(specs.KINDS.values())
     if specs.StudySpec in among and is_study(name):
         among = [specs.StudySpec]
-    known = registry.load()
-    found = [each for each in among if name in known.of(each)]
+    registered = registry.load()
+    found = [each for each in among if name in registered.of(each)]
     unregistered = name.startswith("gym:") or name.endswith(".toml")
     if (among == [specs.TaskSpec] and is_quick(name)) or (unregistered and specs.TaskSpec in among):
         found = [specs.TaskSpec]
@@ -94,7 +94,7 @@ def describe(
     if not found and kind is None and (store := _stored(Selection(folder, published), name)):
         return _code_of_entry(store) if code else _outline(store)
     if not found:
-        names = [each for spec in among for each in known.of(spec)] or list(compose.summaries())
+        names = [each for spec in among for each in registered.of(spec)] or list(compose.summaries())
         names += published_studies.names() if specs.StudySpec in among else []
         more = "; --published looks among the published entries, too" if kind is None else ""
         raise UnknownNameError(f"nothing called '{name}'{nearest(name, names)}{more}")

@@ -541,10 +541,10 @@ def _environment_problems(section: Any) -> list[str]:
 
 def is_quick(name: str) -> bool:
     """Whether a name stands for a task that no file has: `gym:ID`, or an environment without lanes of its own."""
-    known = registry.load()
-    environment = known.of(specs.EnvironmentSpec).get(name)
+    registered = registry.load()
+    environment = registered.of(specs.EnvironmentSpec).get(name)
     without_lanes = environment is not None and environment.spec.vector is None
-    return name.startswith("gym:") or (without_lanes and name not in known.of(specs.TaskSpec))
+    return name.startswith("gym:") or (without_lanes and name not in registered.of(specs.TaskSpec))
 
 
 def load(name: str) -> Task:

@@ -84,17 +84,17 @@ def task_names(runs: Path, tasks: Iterable[str], also: Iterable[Path] = ()) -> l
     held = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     names = []
     for name in tasks:
-        known = registry.load().of(specs.TaskSpec)
+        registered = registry.load().of(specs.TaskSpec)
         if name.startswith("gym:"):
             from qrlsuite.gymlanes import quick_name  # Gymnasium is slow to import
 
             names.append(quick_name(name.removeprefix("gym:")))
         elif name.endswith(".toml"):
             names.append(load(name).name)
-        elif name in held or name in known:
+        elif name in held or name in registered:
             names.append(name)
         else:
-            unknown = f"unknown task '{name}'{nearest(name, {*known, *held})}"
+            unknown = f"unknown task '{name}'{nearest(name, {*registered, *held})}"
             raise UnknownNameError(in_a_file(name) or unknown)
     return names
 

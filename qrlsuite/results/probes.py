@@ -65,8 +65,8 @@ def refusal(store: EntryStore, probe: ProbeRecord) -> DependentSeedsError:
         if identity.model == specs.NO_MODEL
         else (specs.ModelSpec, identity.model)
     )
-    known = registry.load().of(kind)
-    loaded = own.of_distribution(known[name].distribution) if name in known else None
+    registered = registry.load().of(kind)
+    loaded = own.of_distribution(registered[name].distribution) if name in registered else None
     plugin = f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None else ""
     return DependentSeedsError(
         f"seed {probe.seed} depends on its company: trained alone in a fresh process, it differs from the same seed "

@@ -154,14 +154,14 @@ def check_common(subject: Subject) -> tuple[list[Finding], bool]:
 
 
 def _name(subject: Subject) -> None:
-    known = registry.load()
+    registered = registry.load()
     key = type(subject.spec), subject.spec.name
-    owners = [f"{each.distribution} ({each.place})" for each in known.duplicates.get(key, [])]
+    owners = [f"{each.distribution} ({each.place})" for each in registered.duplicates.get(key, [])]
     require(
         not owners,
         f"{subject.spec.title} is registered by both {' and '.join(owners)}: give yours another name",
     )
-    entry = known.of(key[0]).get(key[1])
+    entry = registered.of(key[0]).get(key[1])
     if entry is not None:
         require(
             entry.spec == subject.spec,

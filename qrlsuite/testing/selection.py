@@ -28,13 +28,13 @@ def select(word: str) -> list[CheckTarget]:
     A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
     own; `distribution:NAME` says so where it is not.
     """
-    known = registry.load()
+    registered = registry.load()
     if word.endswith(".toml"):
         return [CheckTarget(specs.TaskSpec, word)]
     kind, colon, name = word.partition(":")
     if colon:
         return _of_kind(kind, name)
-    kinds, distribution = [k for k in specs.KINDS.values() if word in known.of(k)], _distribution(word)
+    kinds, distribution = [k for k in specs.KINDS.values() if word in registered.of(k)], _distribution(word)
     if word == distribution and {owner for k in kinds for owner in _owners(k, word)} <= {word}:
         return of_distribution(word)
     if len(kinds) > 1 or (kinds and word == distribution):
@@ -47,19 +47,19 @@ def select(word: str) -> list[CheckTarget]:
         return _of_kind(kinds[0].kind, word)
     if distribution is not None:
         return of_distribution(distribution)
-    names = {each.spec.name for each in known} | _distributions()
+    names = {each.spec.name for each in registered} | _distributions()
     raise UnknownNameError(f"nothing called '{word}' is registered{nearest(word, names)}")
 
 
 def of_distribution(distribution: str) -> list[CheckTarget]:
     """Return everything that a distribution registers."""
-    known = registry.load()
-    problems = [p.problem for p in known.plugins if p.distribution == distribution and p.problem]
+    registered = registry.load()
+    problems = [p.problem for p in registered.plugins if p.distribution == distribution and p.problem]
     if problems:
         raise QrlSuiteError("; ".join(problems))
     targets = [
         CheckTarget(type(each.spec), each.spec.name)
-        for each in known
+        for each in registered
         if distribution in _owners(type(each.spec), each.spec.name)
     ]
     if not targets:
@@ -86,8 +86,8 @@ def _of_kind(kind: str, name: str) -> list[CheckTarget]:
 
 def _owners(kind: type[specs.Spec], name: str) -> list[str]:
     """Return the distributions that registered a name: more than one where it is a duplicate."""
-    known = registry.load()
-    owners = known.duplicates.get((kind, name)) or [known.entries[kind][name]]
+    registered = registry.load()
+    owners = registered.duplicates.get((kind, name)) or [registered.entries[kind][name]]
     return [each.distribution for each in owners]
 
 

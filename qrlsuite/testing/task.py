@@ -150,9 +150,9 @@ def _ranking(task: Task) -> None:
 def _scores(task: Task) -> None:
     from qrlsuite.training.trainer import build_envs
 
-    known = registry.load()
-    algorithm = next(iter(known.of(specs.AlgorithmSpec).values())).spec
-    model = next(iter(known.of(specs.ModelSpec).values())).spec
+    registered = registry.load()
+    algorithm = next(iter(registered.of(specs.AlgorithmSpec).values())).spec
+    model = next(iter(registered.of(specs.ModelSpec).values())).spec
     choose = np.random.Generator(np.random.Philox(key=9))
     ended = 0
     with _in_its_words():

@@ -59,8 +59,8 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
         raise OptionError(f"--backend {backend}: model '{entry.model.name}' has no circuit")
     spec = registry.get(specs.CircuitBackendSpec, backend)
     options.build(specs.resolve(spec.options), values, f"circuit backend '{backend}'")
-    known = registry.load()
-    for name in known.names(specs.ModelSpec):
+    registered = registry.load()
+    for name in registered.names(specs.ModelSpec):
         model = registry.get(specs.ModelSpec, name)
         on_another = model.options.endswith("]") and not model.options.endswith(f"[{backend}]")
         if model.build != entry.model.build or on_another:

@@ -34,12 +34,12 @@ TRACK = "QRLSUITE_TRACK"
 EVENTS = ("run_started", "epoch_finished", "run_finished")
 
 
-def parse(requests: Sequence[str], known: registry.Registry | None = None) -> dict[str, str | None]:
+def parse(requests: Sequence[str], registered: registry.Registry | None = None) -> dict[str, str | None]:
     """Return targets by name from words `NAME` or `NAME=TARGET`; `known` is this process's registry by default."""
     targets: dict[str, str | None] = {}
     for word in requests:
         name, equals, target = word.strip().partition("=")
-        spec = (known or registry.load()).get(specs.TrackerSpec, name).spec
+        spec = (registered or registry.load()).get(specs.TrackerSpec, name).spec
         for module, command in spec.extras.items():
             if importlib.util.find_spec(module) is None:
                 raise QrlSuiteError(f"tracker '{name}' needs the package '{module}': {command}")
@@ -93,17 +93,17 @@ class EventSink:
         One line for every tracker that was left out.
     """
 
-    def __init__(self, known: registry.Registry, requests: Sequence[str] = ()) -> None:
+    def __init__(self, registered: registry.Registry, requests: Sequence[str] = ()) -> None:
         self.problems: list[str] = []
         self._trackers: dict[str, Any] = {}
-        always = [name for name, each in known.of(specs.TrackerSpec).items() if each.spec.always]
+        always = [name for name, each in registered.of(specs.TrackerSpec).items() if each.spec.always]
         words = {word.partition("=")[0]: word for word in (*always, *requests)}  # a request says the target
         for name, word in words.items():
-            self._guarded(name, "its factory", functools.partial(self._build, known, word))
+            self._guarded(name, "its factory", functools.partial(self._build, registered, word))
 
-    def _build(self, known: registry.Registry, word: str) -> None:
-        [(name, target)] = parse([word], known).items()
-        self._trackers[name] = build(known.get(specs.TrackerSpec, name).spec, target)
+    def _build(self, registered: registry.Registry, word: str) -> None:
+        [(name, target)] = parse([word], registered).items()
+        self._trackers[name] = build(registered.get(specs.TrackerSpec, name).spec, target)
 
     def heard(self, event: str) -> bool:
         """Whether some tracker listens to an event: reading its arguments takes time."""

@@ -87,15 +87,15 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
         raise OptionError(f"environment '{entry.task.environment.name}': {error}") from None
     if kind in entry.algorithm.actions:
         return
-    known = registry.load()
-    others = [each for each in known.names(specs.AlgorithmSpec)
+    registered = registry.load()
+    others = [each for each in registered.names(specs.AlgorithmSpec)
               if kind in registry.get(specs.AlgorithmSpec, each).actions]  # fmt: skip
     advice = (
         f"take one of {', '.join(others)}: qrlsuite run '{others[0]} {entry.model.name}'"
         if others
         else "none does"
     )
-    if known.of(specs.AlgorithmSpec)[entry.algorithm.name].distribution != "qrlsuite":
+    if registered.of(specs.AlgorithmSpec)[entry.algorithm.name].distribution != "qrlsuite":
         advice += (
             f"; if it does take them, write actions={(*entry.algorithm.actions, kind)} in its AlgorithmSpec"
         )

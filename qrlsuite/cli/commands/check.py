@@ -150,8 +150,8 @@ def _print(console: Any, finding: Finding) -> None:
 
 def _teach(json_output: bool) -> None:
     """Print the names that can be checked here."""
-    known = registry.load()
-    others = sorted({plugin.distribution for plugin in known.plugins} - {"qrlsuite"})
+    registered = registry.load()
+    others = sorted({plugin.distribution for plugin in registered.plugins} - {"qrlsuite"})
     if json_output:
         typer.echo(json.dumps({"distributions": others}))
         return

@@ -37,15 +37,15 @@ def list_things(
 
     Examples: qrlsuite list models; qrlsuite list plugins
     """
-    known = registry.load()
+    registered = registry.load()
     if kind == "plugins":
-        _list_plugins(known, json_output)
+        _list_plugins(registered, json_output)
         return
     only = None if kind is None else specs.kind(kind)
     rows = [
         {"kind": each.spec.kinds, "name": each.spec.name, "summary": each.spec.summary}
         | {"distribution": each.distribution}
-        for each in known
+        for each in registered
         if only in (None, type(each.spec))
     ]
     rows += _published_studies() if only in (None, specs.StudySpec) else []

@@ -179,8 +179,8 @@ def end(name: StudyArgument, runs: RunsOption = Path("runs")) -> None:
 def _changes(words: list[str] | None) -> tuple[dict[str, Any], dict[str, str], list[str]]:
     """Return the options that words set, the models that they replace, and the words that entries must have."""
     only, settings = split_settings(words)
-    known = registry.load().names(specs.ModelSpec)
-    models = {name: str(settings.pop(name)) for name in list(settings) if name in known}
+    registered = registry.load().names(specs.ModelSpec)
+    models = {name: str(settings.pop(name)) for name in list(settings) if name in registered}
     return settings, models, only
 
 
