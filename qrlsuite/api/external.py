@@ -42,7 +42,7 @@ def import_curves(
     curves:
         By entry (seeds, points), (N,) and (N, K); or a table with the columns entry, seed, step and score (Arrow, or a
         data frame of pandas or polars); or files: csv with these columns, `evaluations.npz`, `monitor.csv` and
-        `progress.csv` of Stable-Baselines3, event files of TensorBoard, offline files of W&B.
+        `progress.csv` of Stable-Baselines3, event files of TensorBoard.
     steps:
         (K,) environment steps of `points`, increasing.
     task:
@@ -56,7 +56,7 @@ def import_curves(
         Environment steps between two grid points of a new task. By default the curves' own if they are equal, else a
         round number that gives 100 points or fewer.
     metric:
-        The column of a csv file or a table, or the scalar of TensorBoard or W&B, that is the score.
+        The column of a csv file or a table, or the scalar of TensorBoard, that is the score.
     goal:
         `below` where less of it is better, for a new task with `thresholds`.
     runs:
