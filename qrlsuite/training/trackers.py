@@ -82,7 +82,7 @@ class EventSink:
 
     Parameters
     ----------
-    known:
+    registered:
         Where trackers are registered.
     requests:
         The trackers that are asked for, `NAME` or `NAME=TARGET`.

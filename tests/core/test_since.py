@@ -156,7 +156,8 @@ def test_a_preset_that_sets_one_shows_in_the_label_of_those_who_use_it(
     """The label of an entry from before must stay, whatever the preset says later."""
     before = resolve(tiny_task, "mlp")
     upgrade()
-    text = Path(tiny_task).read_text() + "[presets.new.ddqn.all]\nwarm_up = 9\n"
+    usual = "gamma = 0.95\nlr = 5e-4\nbuffer = 2000\nbatch = 64\ntarget_steps = 2000\n"
+    text = Path(tiny_task).read_text() + f"[presets.new.ddqn.all]\n{usual}warm_up = 9\n"
     Path(tiny_task).write_text(text.replace('"ddqn"\n', '"ddqn"\ndefault_preset = "new"\n', 1))
     assert resolve(tiny_task, "mlp").label == f"{before.label} warm_up=9"
     assert facts(resolve(tiny_task, "mlp", settings=words("warm_up=0")))[:3] == facts(before)[:3]
