@@ -47,11 +47,6 @@ class Algorithm(Protocol):
     Store observations and give them to the networks unchanged: if a task normalizes by running statistics, the
     populations of `build_model` standardize their inputs, by statistics that stand still during an epoch
     (`qrlsuite.training.standardization`).
-
-    The class of its options may have a class variable `starting_values`: values of options that a task's preset leaves
-    out, and those of the quick look `--task gym:ID`. It may have a method `unusable(epochs, rounds, environments)`: a
-    list of sentences on settings that are of no use in a run of so many epochs, each of so many steps of every
-    environment of a seed.
     """
 
     def start(self) -> None:
@@ -91,26 +86,3 @@ class Algorithm(Protocol):
 
         The tensors themselves, not copies: `qrlsuite evaluate` loads trained parameters into them.
         """
-
-
-def rare_copies(target_steps: int, steps: int) -> list[str]:
-    """Say that a target network is copied fewer than 5 times in a run of so many gradient steps.
-
-    >>> rare_copies(2000, 2400)
-    ['target_steps=2000 copies the target network once in 2400 gradient steps, first after 83% of the run']
-    """
-    copies = steps // target_steps
-    if copies >= 5:
-        return []
-    if not copies:
-        return [f"target_steps={target_steps} never copies the target network in {steps} gradient steps"]
-    times = "once" if copies == 1 else f"{copies} times"
-    first = f"first after {target_steps / steps:.0%} of the run"
-    return [
-        f"target_steps={target_steps} copies the target network {times} in {steps} gradient steps, {first}"
-    ]
-
-
-def unreached(option: str, value: int, most: int, unit: str) -> list[str]:
-    """Say that an option's value exceeds what a run has: `warm_up=1000 exceeds the run's 600 transitions`."""
-    return [f"{option}={value} exceeds {most} {unit}"] if value > most else []

@@ -506,12 +506,8 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
 def _starting_values(kind: str) -> dict[str, Any]:
     """Return the starting values of the algorithms that take actions of a kind, as a preset."""
     algorithms = (each.spec for each in registry.load().of(specs.AlgorithmSpec).values())
-    values = {
-        each.name: getattr(specs.resolve(each.options), "starting_values", {})
-        for each in algorithms
-        if kind in each.actions
-    }
-    return {name: {"all": dict(given)} for name, given in values.items() if given}
+    fitting = (each for each in algorithms if kind in each.actions and each.starting_values)
+    return {each.name: {"all": dict(each.starting_values)} for each in fitting}
 
 
 def _algorithm(kind: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -220,6 +221,12 @@ class AlgorithmSpec(NumericSpec):
         Reference to the class: see `qrlsuite.algorithm.Algorithm`.
     actions:
         The kinds of actions that it takes: some of `qrlsuite.actions.KINDS`.
+    starting_values:
+        Values of options that a task's preset leaves out, and those of the quick look `--task gym:ID`.
+    unusable:
+        Reference to `unusable(options, epochs, rounds, environments) -> list[str]`: sentences on options (values by
+        name) that are of no use in a run of so many epochs, each of so many rounds, steps of every one of a seed's
+        environments. Boards call it, so its module imports no torch. None says nothing.
     """
 
     kind, kinds = "algorithm", "algorithms"
@@ -227,6 +234,8 @@ class AlgorithmSpec(NumericSpec):
     options: str
     factory: str
     actions: tuple[str, ...] = field(default=("discrete",), kw_only=True)
+    starting_values: Mapping[str, Any] = field(default_factory=dict, kw_only=True, hash=False)
+    unusable: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         Spec.__post_init__(self)

@@ -497,13 +497,16 @@ class EntryResults(Shown):
     @cached_property
     def unusable(self) -> list[str]:
         """Settings of the algorithm that are of no use in runs of this length, by its own account."""
-        finished = any(run.finished for run in self.records.values())
-        if self.external or not finished:
+        registered = registry.load().of(specs.AlgorithmSpec)
+        reference = registered[self.algorithm].spec.unusable if self.algorithm in registered else None
+        if reference is None or not any(run.finished for run in self.records.values()):
             return []
+        protocol = self.task_file.protocol
         try:
-            return self.record.entry(f"{self.folder}").unusable(self.longest)
-        except QrlSuiteError:
-            return []  # its parts are not installed
+            judge, own = specs.resolve(reference), self.options["algorithm"]
+            return list(judge(own, self.longest, protocol.rounds, protocol.environments))
+        except KeyError:
+            return []  # an older record, without the option
 
     @property
     def on_protocol_seeds(self) -> bool:

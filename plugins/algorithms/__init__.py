@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import AlgorithmSpec
+
+CLEANRL_DQN = {"gamma": 0.99, "lr": 2.5e-4, "buffer": 10_000, "batch": 128, "target_steps": 50}
+"""Settings of CleanRL's dqn.py (commit 020cf0e), whose target is copied every 500 steps: 50 gradient steps here."""
 
 
 @hookimpl
@@ -17,6 +21,8 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Double deep Q-learning with replay buffer and target network",
             options="qrlsuite.plugins.algorithms.ddqn:DDQNOptions",
             factory="qrlsuite.plugins.algorithms.ddqn:DDQN",
+            starting_values=CLEANRL_DQN,
+            unusable="qrlsuite.plugins.algorithms:unusable_ddqn",
         )
     )
     register(
@@ -25,6 +31,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Deep recurrent Q-learning: double Q-learning on sequences, for models that remember",
             options="qrlsuite.plugins.algorithms.drqn:DRQNOptions",
             factory="qrlsuite.plugins.algorithms.drqn:DRQN",
+            unusable="qrlsuite.plugins.algorithms:unusable_drqn",
         )
     )
     register(
@@ -34,6 +41,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.ppo:PPOOptions",
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
             actions=("discrete", "box", "multi-discrete", "multi-binary"),
+            unusable="qrlsuite.plugins.algorithms:unusable_ppo",
         )
     )
     register(
@@ -51,6 +59,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.sac:SACOptions",
             factory="qrlsuite.plugins.algorithms.sac:SAC",
             actions=("box", "discrete"),
+            unusable="qrlsuite.plugins.algorithms:unusable_warm_up",
         )
     )
     register(
@@ -60,5 +69,54 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.td3:TD3Options",
             factory="qrlsuite.plugins.algorithms.td3:TD3",
             actions=("box",),
+            unusable="qrlsuite.plugins.algorithms:unusable_warm_up",
         )
     )
+
+
+def _copies(target_steps: int, steps: int) -> list[str]:
+    """Say that a target network is copied fewer than 5 times in a run of so many gradient steps.
+
+    >>> _copies(2000, 2400)
+    ['target_steps=2000 copies the target network once in 2400 gradient steps, first after 83% of the run']
+    """
+    copies = steps // target_steps
+    if copies >= 5:
+        return []
+    if not copies:
+        return [f"target_steps={target_steps} never copies the target network in {steps} gradient steps"]
+    times = "once" if copies == 1 else f"{copies} times"
+    first = f"first after {target_steps / steps:.0%} of the run"
+    return [
+        f"target_steps={target_steps} copies the target network {times} in {steps} gradient steps, {first}"
+    ]
+
+
+def unusable_ddqn(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
+    """Name a target network that is rarely copied, see `qrlsuite.specs.AlgorithmSpec`."""
+    return _copies(own["target_steps"], epochs * rounds)
+
+
+def unusable_drqn(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
+    """Name a target network that is rarely copied, and sequences longer than the run."""
+    steps, sequence = epochs * rounds, own["burn_in"] + own["length"]
+    return [
+        *_copies(own["target_steps"], steps * own["updates"]),
+        *_beyond("burn_in + length", sequence, steps, "steps of an environment"),
+    ]
+
+
+def unusable_ppo(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
+    """Name a minibatch that an epoch does not fill."""
+    return _beyond("batch", own["batch"], rounds * environments, "samples of an epoch")
+
+
+def unusable_warm_up(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
+    """Name a warm-up longer than half of the run, see `qrlsuite.specs.AlgorithmSpec`."""
+    half = epochs * rounds * environments // 2
+    return _beyond("warm_up", own["warm_up"], half, "transitions, half of the run")
+
+
+def _beyond(option: str, value: int, most: int, unit: str) -> list[str]:
+    """Say that an option exceeds what a run has: `batch=64 exceeds 20 samples of an epoch`."""
+    return [f"{option}={value} exceeds {most} {unit}"] if value > most else []

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite import masks
-from qrlsuite.algorithm import BuildModel, rare_copies
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, chosen_errors, chosen_values, part, prefixed
@@ -42,16 +42,6 @@ from qrlsuite.seeding import Streams
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class DDQNOptions:
     """Options of double deep Q-learning; the defaults are the released settings."""
-
-    starting_values: ClassVar[Mapping[str, Any]] = {
-        "gamma": 0.99,
-        "lr": 2.5e-4,
-        "buffer": 10_000,
-        "batch": 128,
-        "target_steps": 50,
-    }
-    """For a task of one's own: CleanRL's dqn.py (commit 020cf0e) copies its target every 500 steps, 50 gradient steps
-    here."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.95
     lr: Annotated[
@@ -78,10 +68,6 @@ class DDQNOptions:
         Field(ge=1, description="gradient steps between copies to the target"),
         Tuned(125, 8000, per_agent=True),
     ] = 2000
-
-    def unusable(self, epochs: int, rounds: int, environments: int) -> list[str]:
-        """Name settings that are of no use in a run of this length, see `qrlsuite.algorithm.Algorithm`."""
-        return rare_copies(self.target_steps, epochs * rounds)
 
 
 class DDQN:

@@ -40,7 +40,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite import masks
-from qrlsuite.algorithm import BuildModel, rare_copies, unreached
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
@@ -73,15 +73,6 @@ class DRQNOptions:
         10_000
     )
     target_steps: Annotated[int, Field(ge=1, description="gradient steps between copies to the target")] = 500
-
-    def unusable(self, epochs: int, rounds: int, environments: int) -> list[str]:
-        """Name settings that are of no use in a run of this length, see `qrlsuite.algorithm.Algorithm`."""
-        return [
-            *rare_copies(self.target_steps, epochs * rounds * self.updates),
-            *unreached(
-                "burn_in + length", self.burn_in + self.length, epochs * rounds, "steps of an environment"
-            ),
-        ]
 
 
 class DRQN:

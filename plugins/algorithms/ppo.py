@@ -63,7 +63,7 @@ from torch import Tensor, nn
 
 from qrlsuite import masks
 from qrlsuite.actions import choices, from_units, information_of_choices, size
-from qrlsuite.algorithm import BuildModel, unreached
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
@@ -112,10 +112,6 @@ class PPOOptions:
         Field(ge=-20, le=2, description="of a box's actions, at first: logarithm, in halves of their range"),
         Since("0.2.0"),
     ] = 0.0
-
-    def unusable(self, epochs: int, rounds: int, environments: int) -> list[str]:
-        """Name settings that are of no use in a run of this length, see `qrlsuite.algorithm.Algorithm`."""
-        return unreached("batch", self.batch, rounds * environments, "samples of an epoch")
 
 
 class Choices:

@@ -52,7 +52,7 @@ from torch import Tensor, nn
 
 from qrlsuite import masks
 from qrlsuite.actions import from_units, information_of_choices, size
-from qrlsuite.algorithm import BuildModel, unreached
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Tuned
@@ -94,11 +94,6 @@ class SACOptions:
         50_000
     )
     batch: Annotated[int, Field(ge=1, description="transitions per gradient step")] = 256
-
-    def unusable(self, epochs: int, rounds: int, environments: int) -> list[str]:
-        """Name settings that are of no use in a run of this length, see `qrlsuite.algorithm.Algorithm`."""
-        half = epochs * rounds * environments // 2
-        return unreached("warm_up", self.warm_up, half, "transitions, half of the run")
 
 
 def log_probabilities(u: Tensor, noise: Tensor, log_spread: Tensor) -> Tensor:

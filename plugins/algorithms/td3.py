@@ -43,7 +43,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite.actions import from_units, size
-from qrlsuite.algorithm import BuildModel, unreached
+from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, follow, gradients, part, prefixed
@@ -84,11 +84,6 @@ class TD3Options:
         50_000
     )
     batch: Annotated[int, Field(ge=1, description="transitions per gradient step")] = 256
-
-    def unusable(self, epochs: int, rounds: int, environments: int) -> list[str]:
-        """Name settings that are of no use in a run of this length, see `qrlsuite.algorithm.Algorithm`."""
-        half = epochs * rounds * environments // 2
-        return unreached("warm_up", self.warm_up, half, "transitions, half of the run")
 
 
 class TD3:

@@ -155,8 +155,11 @@ class Entry:
     def unusable(self, epochs: int) -> list[str]:
         """Name settings of the algorithm that are of no use in a run of so many epochs, by its own account."""
         protocol = self.task.file.protocol
-        own = getattr(self.algorithm_options, "unusable", None)
-        return [] if own is None else list(own(epochs, protocol.rounds, protocol.environments))
+        if self.algorithm.unusable is None:
+            return []
+        own = options.plain(self.algorithm_options)
+        judge = specs.resolve(self.algorithm.unusable)
+        return list(judge(own, epochs, protocol.rounds, protocol.environments))
 
     def distributions(self) -> list[str]:
         """Return the distributions whose code makes the entry's numbers, each once."""

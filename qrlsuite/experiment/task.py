@@ -445,8 +445,7 @@ class Task:
 def starting_values(algorithm: str) -> Mapping[str, Any]:
     """Return an algorithm's values for options that a task's preset leaves out; by default none."""
     registered = registry.load().of(specs.AlgorithmSpec)
-    cls = specs.resolve(registered[algorithm].spec.options) if algorithm in registered else None
-    return getattr(cls, "starting_values", {})
+    return registered[algorithm].spec.starting_values if algorithm in registered else {}
 
 
 def digest(content: Any) -> str:

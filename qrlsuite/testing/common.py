@@ -18,7 +18,7 @@ from qrlsuite.experiment.task import load as load_task
 from qrlsuite.testing.findings import Checklist, Finding, require
 from qrlsuite.testing.fresh import HEAVY, fresh_process
 
-REFERENCES = ("options", "build", "factory", "population", "vector", "entry_point")
+REFERENCES = ("options", "build", "factory", "population", "vector", "entry_point", "unusable")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import io
+import subprocess
 import sys
 from dataclasses import replace
 from html import unescape
@@ -246,3 +247,13 @@ def test_the_examples_are_right() -> None:
     results = [doctest.testmod(module) for module in modules]
     assert sum(result.attempted for result in results) >= 5
     assert not any(result.failed for result in results)
+
+
+def test_boards_and_comparisons_import_no_torch() -> None:
+    """It takes a second, and nothing is computed with it."""
+    code = (
+        "import sys; from qrlsuite import api; where = dict(task='beam6g', runs='runs', published=True); "
+        "api.board(**where).sheets(explain=True); api.compare('mlp width=64', 'mlp width=16', **where); "
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
