@@ -496,15 +496,15 @@ class EntryResults(Shown):
 
     @cached_property
     def unusable(self) -> list[str]:
-        """Settings of the algorithm that are of no use in runs of this length, by its own account."""
+        """Settings of the algorithm that are of no use in the longest run as it was trained, however it is cut here."""
         registered = registry.load().of(specs.AlgorithmSpec)
         reference = registered[self.algorithm].spec.unusable if self.algorithm in registered else None
         if reference is None or not any(run.finished for run in self.records.values()):
             return []
-        protocol = self.task_file.protocol
+        protocol, trained = self.task_file.protocol, max(run.epochs for run in self.records.values())
         try:
             judge, own = specs.resolve(reference), self.options["algorithm"]
-            return list(judge(own, self.longest, protocol.rounds, protocol.environments))
+            return list(judge(own, trained, protocol.rounds, protocol.environments))
         except KeyError:
             return []  # an older record, without the option
 

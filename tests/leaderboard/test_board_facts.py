@@ -186,6 +186,18 @@ def test_every_verdict_names_what_may_lie_behind_it(note: str) -> None:
     assert not any(remark.partition(":")[0] == text.partition(":")[0] for remark in others)
 
 
+def test_a_setting_is_judged_by_the_run_as_trained_not_as_cut() -> None:
+    """The target is copied every 2000 of 20,000 gradient steps; a run of 30 epochs copies it 3 times."""
+    whole = boards.changed(boards.entry("mlp"), identity={"algorithm_options": {"target_steps": 2000}})
+    cut, short = whole.cut(30), boards.changed(whole, curves=whole.curves[:, :30])
+    assert cut is not None
+    assert cut.curves.shape == short.curves.shape
+    assert whole.unusable == cut.unusable == []
+    said = "target_steps=2000 copies the target network 3 times in 6000 gradient steps, first after 33% of the run"
+    assert short.unusable == [said]
+    assert f"{said}: {short.label}" in compare_entries(short, boards.entry("mlp-2 width=2")).remarks
+
+
 def test_unfinished_seeds_are_named() -> None:
     one, two = boards.graded(2)
     short = {seed: replace(one.records[seed], scores=one.records[seed].scores[:40]) for seed in (6, 7, 9)}
