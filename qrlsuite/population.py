@@ -13,22 +13,34 @@ import functools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
 from qrlsuite.errors import PluginError
-from qrlsuite.options import per_agent
+from qrlsuite.options import Since, per_agent
 
 if TYPE_CHECKING:
     from qrlsuite.compiled.perceptron import Sweep
 
 NARROW = 16
 """Layers below this width on both sides multiply in a fixed order, see `linear`."""
+
+DecaySteps = Annotated[
+    int | None,
+    Field(
+        ge=1,
+        description="interactions of a seed after which learning rates have fallen to 0, linearly, epoch by epoch; "
+        "absent: they stay",
+    ),
+    Since("0.2.0"),
+]
+"""An algorithm's option, see `Adam.decay`."""
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -529,6 +541,7 @@ class Adam:
             name: (quantum_lr if name in quantum else classical_lr) * factors.get(name, 1.0)
             for name, _ in self._named
         }
+        self._first_rates = dict(self.rates)
         self._quantum = quantum
         self.betas = betas
         self.eps = eps
@@ -539,6 +552,12 @@ class Adam:
         self.mean = {name: torch.zeros_like(p) for name, p in self._named}
         self.square = {name: torch.zeros_like(p) for name, p in self._named}
         self._blocks: tuple[Any, ...] | None = None
+
+    def decay(self, interactions: int, decay_steps: int | None) -> None:
+        """Set the learning rates to what is left of the first ones after so many of `decay_steps` interactions."""
+        if decay_steps is not None:
+            left = max(0.0, 1.0 - interactions / decay_steps)
+            self.rates = {name: rate * left for name, rate in self._first_rates.items()}
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -675,6 +694,19 @@ def gradients(loss: Tensor, population: nn.Module) -> None:
     parameters = [p for p in population.parameters() if p.requires_grad]
     for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters, allow_unused=True)):
         parameter.grad = gradient
+
+
+@torch.no_grad()
+def clip_gradients(longest: float, *populations: nn.Module) -> None:
+    """Scale the gradients of an agent in all these networks together down to the norm `longest`, where it is greater.
+
+    Squares are added one by one, in an order that other agents do not change.
+    """
+    own = [p.grad for each in populations for p in each.parameters() if p.grad is not None]
+    squares = [gradient.double().square().flatten(1).cumsum(1)[:, -1:] for gradient in own]
+    scale = (longest / torch.cat(squares, 1).cumsum(1)[:, -1].sqrt()).clamp(max=1.0)
+    for gradient in own:
+        gradient.mul_(scale.to(gradient).view(-1, *[1] * (gradient.dim() - 1)))
 
 
 @torch.no_grad()

@@ -93,8 +93,13 @@ def _copies(target_steps: int, steps: int) -> list[str]:
 
 
 def unusable_ddqn(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
-    """Name a target network that is rarely copied, see `qrlsuite.specs.AlgorithmSpec`."""
-    return _copies(own["target_steps"], epochs * rounds)
+    """Name a target network that is rarely copied, and exploration longer than half of the run."""
+    steps = epochs * rounds
+    return [
+        *_copies(own["target_steps"], steps),
+        *_beyond("epsilon_steps", own["epsilon_steps"] or 0, steps * environments // 2, HALF),
+        *_stops(own["decay_steps"], steps * environments),
+    ]
 
 
 def unusable_drqn(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
@@ -107,14 +112,32 @@ def unusable_drqn(own: Mapping[str, Any], epochs: int, rounds: int, environments
 
 
 def unusable_ppo(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
-    """Name a minibatch that an epoch does not fill."""
-    return _beyond("batch", own["batch"], rounds * environments, "samples of an epoch")
+    """Name a minibatch that an epoch does not fill, and learning that stops early."""
+    samples = rounds * environments
+    return [
+        *_beyond("batch", own["batch"], samples, "samples of an epoch"),
+        *_stops(own["decay_steps"], epochs * samples),
+    ]
 
 
 def unusable_warm_up(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
-    """Name a warm-up longer than half of the run, see `qrlsuite.specs.AlgorithmSpec`."""
-    half = epochs * rounds * environments // 2
-    return _beyond("warm_up", own["warm_up"], half, "transitions, half of the run")
+    """Name a warm-up longer than half of the run, and learning that stops early."""
+    run = epochs * rounds * environments
+    return [*_beyond("warm_up", own["warm_up"], run // 2, HALF), *_stops(own.get("decay_steps"), run)]
+
+
+HALF = "transitions, half of the run"
+
+
+def _stops(decay_steps: int | None, run: int) -> list[str]:
+    """Say that learning rates are 0 for a second half of a run of so many interactions, or for more.
+
+    >>> _stops(400, 1000), _stops(501, 1000)
+    (['decay_steps=400 stops learning after 40% of the run'], [])
+    """
+    if decay_steps is None or decay_steps > run // 2:
+        return []
+    return [f"decay_steps={decay_steps} stops learning after {decay_steps / run:.0%} of the run"]
 
 
 def _beyond(option: str, value: int, most: int, unit: str) -> list[str]:

@@ -15,6 +15,7 @@ Deviations from the paper (section 'Experimental Setup' and its appendix):
 - Buffer 2000 and a target copy every 2000 gradient steps are the released defaults; the text's table says
   1000 and 1000 (a task's preset `text`).
 - There is no warm-up: the first update follows the first round, as released.
+- Neither probability of a random action nor learning rates change, unless `epsilon_steps` and `decay_steps` say so.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from torch import Tensor
 from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
-from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, chosen_errors, chosen_values, part, prefixed
+from qrlsuite.options import Since, Tuned
+from qrlsuite.population import Adam, DecaySteps, by_seed, chosen_errors, chosen_values, part, prefixed
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
@@ -68,6 +69,16 @@ class DDQNOptions:
         Field(ge=1, description="gradient steps between copies to the target"),
         Tuned(125, 8000, per_agent=True),
     ] = 2000
+    decay_steps: DecaySteps = None
+    epsilon_steps: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            description="interactions of a seed over which the probability falls linearly from 1 to epsilon; absent: "
+            "it is epsilon from the first on",
+        ),
+        Since("0.2.0"),
+    ] = None
 
 
 class DDQN:
@@ -111,6 +122,7 @@ class DDQN:
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
         losses = torch.zeros(self.S, dtype=torch.float64, device=self.device)
+        self.adam.decay(self.epoch * rounds * self.E, self.options.decay_steps)
         for k, (explore, action, draws) in enumerate(zip(*self._epoch_numbers(rounds))):
             greedy = self._greedy(self.observations)
             uniform = masks.drawn(action, self.observations, self.obs_dim, self.streams, self.epoch, k)
@@ -124,9 +136,15 @@ class DDQN:
         explore = np.empty((rounds, self.S, self.E), dtype=bool)
         action = np.empty((rounds, self.S, self.E), dtype=np.int64)
         draws = np.empty((rounds, self.S, self.options.batch))
+        epsilon = np.broadcast_to(self.epsilon, (rounds, self.S))
+        if self.options.epsilon_steps is not None:
+            interactions = (self.epoch * rounds + np.arange(rounds)[:, None]) * self.E
+            epsilon = epsilon + (1.0 - epsilon) * np.maximum(
+                0.0, 1.0 - interactions / self.options.epsilon_steps
+            )
         for s, streams in enumerate(self.streams):
             exploration = streams.numpy("exploration", self.epoch)
-            explore[:, s] = exploration.random((rounds, self.E)) < self.epsilon[s]
+            explore[:, s] = exploration.random((rounds, self.E)) < epsilon[:, s, None]
             action[:, s] = exploration.integers(self.actions, size=(rounds, self.E))
             draws[:, s] = streams.numpy("replay", self.epoch).random((rounds, self.options.batch))
         return tuple(torch.from_numpy(a).to(self.device) for a in (explore, action, draws))  # type: ignore[return-value]

@@ -41,8 +41,8 @@ gradient of - mean log pi(a|s) A, A2C's gradient (Mnih et al. 2016, arXiv:1602.0
 Deviations from the paper (its algorithm 'Estimating the Sample Complexity of PPO' and its table of hyperparameters):
 - The paper's epoch is one whole episode of each environment. Ours is as many steps, so that every agent learns from
   equally many samples whatever the lengths of its episodes; with 200 steps per episode and environment the two agree.
-- The table's "gradient clipping" is the clipping of the ratio. Gradients, values and value errors are not clipped,
-  nothing is annealed, and the updates do not stop early.
+- The table's "gradient clipping" is the clipping of the ratio. Gradients and values are clipped, and learning rates
+  fall, where `longest_gradient`, `value_clip` and `decay_steps` say so; the updates do not stop early.
 - The clip range depends on the family, 0.1 for classical and 0.2 for quantum models: a task's preset says so.
 - GAE parameter, value and entropy coefficients are the released code's; the text is silent.
 - Validation is greedy; the released code samples (`validation = "sampled"`).
@@ -66,7 +66,17 @@ from qrlsuite.actions import choices, from_units, information_of_choices, size
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
+from qrlsuite.population import (
+    Adam,
+    DecaySteps,
+    by_seed,
+    clip_gradients,
+    part,
+    prefixed,
+    remember,
+    remembers,
+    unroll,
+)
 from qrlsuite.seeding import Streams
 
 FloatArray = NDArray[np.float64]
@@ -112,6 +122,17 @@ class PPOOptions:
         Field(ge=-20, le=2, description="of a box's actions, at first: logarithm, in halves of their range"),
         Since("0.2.0"),
     ] = 0.0
+    value_clip: Annotated[
+        float | None,
+        Field(gt=0, description="values this far from the collected ones learn no more; absent: all do"),
+        Since("0.2.0"),
+    ] = None
+    longest_gradient: Annotated[
+        float | None,
+        Field(gt=0, description="norm to which an agent's longer gradients are scaled down; absent: none is"),
+        Since("0.2.0"),
+    ] = None
+    decay_steps: DecaySteps = None
 
 
 class Choices:
@@ -341,6 +362,8 @@ class PPO:
         Returns the means over the epoch's minibatches (S,) of `policy_loss`, `value_loss` (mean squared error),
         `entropy` and `kl`, an estimate of how far the policy has moved from the one that collected the samples.
         """
+        for adam in self.adams:
+            adam.decay(self.epoch * rounds * self.E, self.options.decay_steps)
         rollout = self._collect(rounds)
         advantages, returns, critic_remembered = self._estimate(rollout)
         states = rollout.states.flatten(0, 1)
@@ -519,12 +542,21 @@ class PPO:
         ratio = log_ratio.exp()
         a = _normalized(advantages)
         policy_loss = -torch.minimum(ratio * a, ratio.clamp(*self.clip) * a).mean(1)
-        value_loss = (_outputs(self.critic, plain, *memory[::2]).squeeze(2) - returns).square().mean(1)
+        values = _outputs(self.critic, plain, *memory[::2]).squeeze(2)
+        value_errors = (values - returns).square()
+        if o.value_clip is not None:
+            collected = returns - advantages
+            near = collected + (values - collected).clamp(-o.value_clip, o.value_clip)
+            value_errors = torch.maximum(value_errors, (near - returns).square())
+        value_loss = value_errors.mean(1)
         entropy = entropies.mean(1)
         losses = policy_loss + o.value_coefficient * value_loss - o.entropy_coefficient * entropy
         for adam in self.adams:
             adam.zero_grad()
         torch.autograd.backward(losses.sum())
+        if o.longest_gradient is not None:
+            spreads = [self.policy] if isinstance(self.policy, Gaussian) else []
+            clip_gradients(o.longest_gradient, self.actor, self.critic, *spreads)
         for adam in self.adams:
             adam.step()
         with torch.no_grad():

@@ -56,7 +56,7 @@ from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, follow, gradients, part, prefixed
+from qrlsuite.population import Adam, DecaySteps, by_seed, follow, gradients, part, prefixed
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
@@ -94,6 +94,7 @@ class SACOptions:
         50_000
     )
     batch: Annotated[int, Field(ge=1, description="transitions per gradient step")] = 256
+    decay_steps: DecaySteps = None
 
 
 def log_probabilities(u: Tensor, noise: Tensor, log_spread: Tensor) -> Tensor:
@@ -184,6 +185,8 @@ class SAC:
         explore, uniform, draws, noise = self._epoch_numbers(rounds)
         total = torch.zeros((4, self.S), dtype=torch.float64, device=self.device)
         steps = 0
+        for adam in self.adams.values():
+            adam.decay(self.epoch * rounds * self.E, o.decay_steps)
         for k in range(rounds):
             if self.replay.stored >= o.warm_up:
                 self._interact(self._draw(self.observations, explore[:, k]))

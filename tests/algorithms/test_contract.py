@@ -31,10 +31,17 @@ COUNTED = {
 }
 """Networks, and classical and quantum parameters: 3 inputs, 3 outputs or 1, width 16 and depth 2; 2 qubits, 1 layer."""
 VARIANTS: dict[str, list[dict[str, Any]]] = {
-    "ddqn": [{"buffer": 50, "batch": 16, "target_steps": 4}],
-    "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
+    "ddqn": [
+        {"buffer": 50, "batch": 16, "target_steps": 4},
+        {"buffer": 50, "batch": 16, "decay_steps": 55, "epsilon_steps": 40},
+    ],
+    "ppo": [
+        {"batch": 8, "repeats": 2},
+        {"batch": 64, "repeats": 3, "validation": "sampled"},
+        {"batch": 8, "repeats": 2, "value_clip": 0.01, "longest_gradient": 0.1, "decay_steps": 55},
+    ],
     "drqn": [{"buffer": 40, "batch": 7, "length": 3, "burn_in": 2, "target_steps": 4}],
-    "sac": [{"buffer": 50, "batch": 7, "warm_up": 12}],
+    "sac": [{"buffer": 50, "batch": 7, "warm_up": 12, "decay_steps": 55}],
     "td3": [{"buffer": 50, "batch": 7, "warm_up": 12, "updates": 2}],
     "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 4), ("mean", 90), ("value", 12))],
 }

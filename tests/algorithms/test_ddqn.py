@@ -92,6 +92,21 @@ def test_epsilon_is_the_probability_of_any_action(epsilon: float, low: float, hi
         np.testing.assert_allclose(np.bincount(chosen, minlength=3) / 3000, 1 / 3, atol=0.03)
 
 
+def test_exploration_and_learning_fall_to_their_ends() -> None:
+    """After 2 of 4 epochs, halfway: a half of the actions are drawn; after 4, none, and no learning."""
+    group = Group(
+        "ddqn", [0], Contexts(20), epsilon=0.0, batch=2, lr=1e-12, decay_steps=6000, epsilon_steps=6000
+    )
+    made: DDQN = group.start().algorithm
+    made.online.get_parameter("b1").data[:] = torch.tensor([0.0, 50.0, 0.0])
+    for left in (1.0, 0.75, 0.5, 0.25, 0.0, 0.0):
+        made.train_epoch(75)
+        assert made.adam.rates["w0"] == pytest.approx(left * 1e-12)
+    other = [(each != 1).mean() for each in np.split(np.concatenate(group.envs.history), 6)]  # type: ignore[attr-defined]
+    np.testing.assert_allclose(other, np.array([0.875, 0.625, 0.375, 0.125, 0, 0]) * 2 / 3, atol=0.05)
+    assert other[4:] == [0, 0]
+
+
 def test_buffer_wraps_around() -> None:
     """Environment e's step t has reward t + 1: after three rounds of two, the sixth transition replaces the first."""
     group = Group("ddqn", [0], Clock([9, 9]), buffer=5, batch=2).start()

@@ -126,6 +126,36 @@ def test_first_update_is_that_of_an_independent_computation() -> None:
         critics[s].assert_updated(made.critic, 0.7 * 2 * error[:, None] / B, lr, s)
 
 
+def test_values_and_gradients_are_clipped_as_cleanrls_are() -> None:
+    """By its formula of the value loss, and torch's own scaling of one agent's gradients, in another population."""
+    generator = torch.Generator().manual_seed(2)
+    states, old = torch.rand((2, 40, 4), generator=generator), torch.full((2, 40), -1.0)
+    actions = torch.randint(3, (2, 40, 1), generator=generator)
+    advantages, returns = (torch.randn((2, 40), generator=generator) for _ in range(2))
+    made, free = (
+        ppo([1, 2], entropy_coefficient=0, **own)
+        for own in ({"value_clip": 0.5, "longest_gradient": 0.376}, {})
+    )
+    made._learn(states, actions, old, advantages, returns)
+    values, collected = free.critic(states)[..., 0], returns - advantages
+    near = collected + torch.clamp(values - collected, -0.5, 0.5)
+    assert 0.1 < (near != values).float().mean() < 0.9
+    value_loss = 0.5 * torch.max((values - returns) ** 2, (near - returns) ** 2).mean(1)
+    ratio = (free.policy.judge(free.actor(states), actions)[0] - old).exp()
+    scaled = (advantages - advantages.mean(1, keepdim=True)) / (advantages.std(1, keepdim=True) + 1e-8)
+    policy_loss = -torch.min(ratio * scaled, ratio.clamp(0.9, 1.1) * scaled).mean(1)
+    (policy_loss + value_loss).sum().backward()
+    lengths = []
+    for s in range(2):
+        own = [torch.zeros_like(p[s]) for p in (*free.actor.parameters(), *free.critic.parameters())]
+        for each, p in zip(own, (*free.actor.parameters(), *free.critic.parameters())):
+            each.grad = p.grad[s]
+        lengths.append(torch.nn.utils.clip_grad_norm_(own, 0.376))
+        for each, p in zip(own, (*made.actor.parameters(), *made.critic.parameters())):
+            torch.testing.assert_close(p.grad[s], each.grad, rtol=1e-4, atol=1e-6)
+    assert min(lengths) < 0.376 < max(lengths), "one agent's gradients are scaled, the other's are not"
+
+
 def test_advantages_are_normalized_within_the_minibatch() -> None:
     """Shifting and scaling a minibatch's advantages changes nothing."""
     results = []

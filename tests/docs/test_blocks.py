@@ -93,7 +93,7 @@ def test_the_readmes_plugin_is_what_its_summary_says_and_conforms(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("name", "registers"), [("mine", "ansatz chain, model hybrid"), ("agent", "algorithm watkins")]
+    ("name", "registers"), [("mine", "ansatz chain, model hybrid"), ("agent", "algorithm actor-critic")]
 )
 def test_the_plugins_by_path_conform(name: str, registers: str, tmp_path: Path) -> None:
     text = (ROOT / "docs" / "plugins.md").read_text()
