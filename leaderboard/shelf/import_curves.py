@@ -5,7 +5,8 @@ genuine. Its algorithm is called `external`, so every label shows it, and `impor
 source.
 
 Curves are brought to a grid of equal steps: the score at a grid point is the last observation at or before it. Nothing
-is interpolated, nothing is carried backward, and no curve goes on beyond its last observation.
+is interpolated, nothing is carried backward, and a curve goes on beyond its last observation only where the user says
+what its early end meant. Entries that were scored in different ways, or whose scales differ tenfold, are not imported.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pydantic
@@ -32,11 +34,11 @@ from qrlsuite.experiment.task import TaskFile, digest
 from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.import_seeds import Imported, unite
 from qrlsuite.options import parse_setting
-from qrlsuite.results import provenance
+from qrlsuite.results import provenance, run_files
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.genuine import require_no_link
 from qrlsuite.results.points import Points, Run
-from qrlsuite.results.records import EntryRecord, RunRecord
+from qrlsuite.results.records import EntryRecord, ImportedRecord, RunRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import (
     EntryStore,
@@ -56,6 +58,14 @@ GRID_POINTS = 100
 _MOST_GRID_POINTS = 100_000
 _ALIKE = 0.9
 """Runs that reach this share of the longest are cut to one length."""
+_LATE = 0.1
+"""Share of the grid's step by which evaluations may be late, if a run has one for each grid point."""
+EARLY = {
+    "solved": "they stopped because they had learned, so their last score holds",
+    "failed": "they crashed or never learned, so they never reach a threshold from there on",
+    "cut": "every run is to be cut to the shortest",
+}
+"""Meanings of runs that end before the others of their entry."""
 _EPSILONS, _REFERENCE = [0.1, 0.2, 0.3, 0.4], 0.2
 _DELTAS, _DELTA = [0.5, 0.75], 0.5
 
@@ -69,39 +79,29 @@ def import_points(
     every: int | None = None,
     goal: Goal | None = None,
     metric: str | None = None,
+    early: str | None = None,
+    units: str | None = None,
 ) -> list[Imported]:
-    """Write curves to a results folder as the seeds of external entries.
+    """Write curves to a results folder as the seeds of external entries; the options are those of `import_curves`.
 
     Parameters
     ----------
     points:
         Steps and scores of each run.
-    task:
-        A task of the suite or of the results folder, which fixes the grid and the thresholds; or a new name.
-    maximum:
-        The best possible score: scores become fractions of it.
-    thresholds:
-        Thresholds of a new task; by default .6, .7, .8 and .9 of the maximum.
-    every:
-        Environment steps between two grid points of a new task.
-    goal:
-        `below` if less is better, for a new task with thresholds; None is `above`.
-    metric:
-        Name of the score if less is better.
-
-    Returns
-    -------
-    list
-        The imported seeds of each entry.
     """
-    given = _require_options(maximum, thresholds, every, goal)
+    given = _require_options(maximum, thresholds, every, goal, early, units)
     name = task or EXTERNAL
     known = _known_task(name, runs)
+    held = entries(runs, known[2]) if known is not None and runs.is_dir() else []
+    held = [store for store in held if store.record().imported is not None]
+    scales = _scales(points)
+    _require_comparable(scales, known[0] if known else None, held, units)
+    step = known[0].protocol.interactions if known else every or _grid_of(points.values())
+    points = {run: replace(own, steps=_punctual(own.steps, step)) for run, own in points.items()}
+    lengths = _lengths(points, step, early, held)
+    instead = "another --task" if known else f"every={max(int(own.steps[0]) for own in points.values())}"
+    curves = {run: _on_grid(own, step, lengths[run[0]], run, instead) for run, own in points.items()}
     if known is None:
-        step = every or _grid_of(points.values())
-        curves = _cut(
-            {run: _on_grid(own, step, run, f"every={_first(points)}") for run, own in points.items()}
-        )
         _require_reachable(curves, given, goal == "below")
         file = _new_task(name, step, curves, maximum, given, _score_of(goal, metric, maximum))
         definition = _definition(file)
@@ -110,25 +110,130 @@ def import_points(
         _require_same_options(file, maximum, given, every)
         if goal not in (None, file.score.goal):
             raise OptionError(f"goal={goal}: task '{file.name}' has {file.score.goal}; leave it out")
-        step = file.protocol.interactions
-        curves = _cut({run: _on_grid(own, step, run, "another --task") for run, own in points.items()})
+    if early == "failed":
+        worst = _worst(curves.values(), file)
+        for run, own in points.items():
+            curves[run][int(own.steps[-1]) // step :] = worst
     best = file.score.max_return if maximum is None else maximum
-    scores = {run: _scores(curve, best, file, run, points[run].source) for run, curve in curves.items()}
+    scores = {run: _scores(curve, best, file, run, points[run].source, step) for run, curve in curves.items()}
     by_entry: dict[str, dict[int, NDArray[np.float64]]] = defaultdict(dict)
     for (entry, seed), curve in sorted(scores.items()):
         by_entry[entry][seed] = curve
-    told = {
-        "grid": f"every {step} steps, the last score at or before; nothing interpolated",
-        "maximum": best,
-    }
+    grid = f"every {step} steps, the last score at or before; nothing interpolated"
     stores = {}
     for entry, of_seeds in by_entry.items():
+        told = {"grid": grid, "maximum": best, **scales[entry].content}
         record = _record(entry, name, file, definition, told)
         stores[entry] = EntryStore(runs / name / record.name), record
         _require_no_copies(
             entry, {seed: curves[entry, seed] for seed in of_seeds}, of_seeds, stores[entry][0]
         )
-    return [_write(entry, of_seeds, *stores[entry], points) for entry, of_seeds in by_entry.items()]
+    return [_write(entry, of_seeds, *stores[entry], points, early) for entry, of_seeds in by_entry.items()]
+
+
+def _scales(points: Mapping[Run, Points]) -> dict[str, ImportedRecord]:
+    """Return how each entry was scored, and its largest score and last step."""
+    found = {}
+    for entry in sorted({entry for entry, _ in points}):
+        runs = [own for (name, _), own in points.items() if name == entry]
+        first, *others = sorted({own.metric for own in runs})
+        if others:
+            _refuse_metrics(f"'{entry}'", first, "in another file", others[0])
+        largest = max(float(np.abs(own.scores).max()) for own in runs)
+        last = max(int(own.steps[-1]) for own in runs)
+        found[entry] = ImportedRecord(metric=first, largest=largest, last_step=last)
+    return found
+
+
+def _refuse_metrics(first: str, metric: str, second: str, other: str) -> NoReturn:
+    raise FileError(
+        f"the score of {first} is {metric}, {second} {other}: curves of different scores are not compared. Type "
+        "metric=NAME with a score that all files have, or import them into another --task NAME"
+    )
+
+
+def _require_comparable(
+    scales: Mapping[str, ImportedRecord], file: TaskFile | None, held: Sequence[EntryStore], units: str | None
+) -> None:
+    """Refuse entries that were scored in different ways, or whose scales differ tenfold."""
+    records = [store.record() for store in held]
+    before = [(f"'{each.label}', imported before,", each.imported) for each in records if each.imported]
+    every = [*((f"'{entry}'", scale) for entry, scale in scales.items()), *before]
+    named = [(entry, scale.metric) for entry, scale in every if scale.metric]
+    for entry, metric in named:
+        if metric != named[0][1]:
+            _refuse_metrics(*named[0], f"that of {entry}", metric)
+        if metric in run_files.WHILE_TRAINING and file is not None and file.environment.name != EXTERNAL:
+            _refuse_metrics(entry, metric, f"that of task '{file.name}'", "a validation without exploration")
+    for kind, name in (("score", "largest"), ("step", "last_step")):
+        sizes = sorted((size, entry) for entry, scale in every if (size := getattr(scale, name)))
+        told = sorted(size for _, scale in before if (size := getattr(scale, name)))
+        if not (units or _tenfold(told)) and _tenfold([size for size, _ in sizes]):
+            (low, small), (high, large) = sizes[0], sizes[-1]
+            raise FileError(
+                f"the largest {kind} of {large} is {high:g}, that of {small} {low:g}: if they are in one unit, type "
+                "units=same; if not, write one unit in all files"
+            )
+
+
+def _tenfold(sizes: Sequence[float]) -> bool:
+    return bool(sizes) and sizes[-1] > 10 * sizes[0]
+
+
+def _punctual(steps: NDArray[np.int64], every: int) -> NDArray[np.int64]:
+    """Return the grid points of a run that has one evaluation for each, some a little late; else its own steps."""
+    grid = every * np.arange(1, len(steps) + 1)
+    late = steps - grid
+    return grid if late.min() >= 0 and late.max() <= _LATE * every else steps
+
+
+def _lengths(
+    points: Mapping[Run, Points], every: int, early: str | None, held: Sequence[EntryStore]
+) -> dict[str, int]:
+    """Return the grid points of each entry's curves.
+
+    Runs that end with an episode differ a little in length, and are cut to the shortest of their entry. Runs that end
+    long before the longest of their entry get its length, or every run is cut to the shortest, as the user says.
+    """
+    ends: dict[str, dict[int, int]] = defaultdict(dict)
+    for (entry, seed), own in points.items():
+        ends[entry][seed] = int(own.steps[-1]) // every
+    lengths, texts, others = {}, [], {}
+    for entry, of_entry in ends.items():
+        stored = [store for store in held if store.record().label == f"{EXTERNAL} {entry}"]
+        before = {seed: len(store.seed(seed).read().scores) for store in stored for seed in store.seeds()}
+        together, least = {**before, **of_entry}, _ALIKE * max([*before.values(), *of_entry.values()])
+        lengths[entry] = min(end for end in together.values() if end >= least)
+        others[entry] = {end for seed, end in before.items() if seed not in of_entry}
+        if short := {seed: end for seed, end in together.items() if end < least}:
+            seeds, first = format_seeds(sorted(short)), every * min(short.values())
+            texts.append(
+                f"seeds {seeds} of '{entry}' from step {first} on, others at {every * lengths[entry]}"
+            )
+    if texts and early is None:
+        choices = "; or ".join(f"early={word} if {meaning}" for word, meaning in EARLY.items())
+        raise FileError(f"runs end before the others of their entry: {'; '.join(texts)}. Type {choices}")
+    if early == "cut":
+        lengths = dict.fromkeys(lengths, min(min(of_entry.values()) for of_entry in ends.values()))
+    for entry, length in lengths.items():
+        if early is not None and others[entry] - {length}:
+            raise FileError(
+                f"'{entry}' has runs of another length here: import all of them together, as another --task"
+            )
+        if length < 1:
+            last = min(int(own.steps[-1]) for run, own in points.items() if run[0] == entry)
+            raise FileError(
+                f"a run of '{entry}' ends at step {last}, before the first grid point: type every={last}"
+            )
+    return lengths
+
+
+def _worst(curves: Iterable[NDArray[np.float64]], file: TaskFile) -> float:
+    """Return the score of a run that has failed: the worst that there is, which reaches no threshold."""
+    if file.ranking.thresholds is None:
+        return 0.0
+    scores = np.concatenate(list(curves))
+    return float(scores.max() if file.score.goal == "below" else scores.min())
 
 
 def _score_of(goal: Goal | None, metric: str | None, maximum: float | None) -> dict[str, Any]:
@@ -140,7 +245,12 @@ def _score_of(goal: Goal | None, metric: str | None, maximum: float | None) -> d
 
 
 def _require_options(
-    maximum: float | None, thresholds: Sequence[float], every: int | None, goal: Goal | None
+    maximum: float | None,
+    thresholds: Sequence[float],
+    every: int | None,
+    goal: Goal | None,
+    early: str | None,
+    units: str | None,
 ) -> list[float]:
     """Return the thresholds, sorted."""
     if maximum is not None and not (math.isfinite(maximum) and maximum > 0):
@@ -151,6 +261,9 @@ def _require_options(
         raise OptionError(
             "goal=below: give thresholds=A,B,... in place of maximum, which is the best high score"
         )
+    for name, value, words in (("early", early, tuple(EARLY)), ("units", units, ("same",))):
+        if value is not None and value not in words:
+            raise OptionError(f"{name}={ascii(value)[1:-1]}: write {' or '.join(words)}")
     levels = sorted(float(level) for level in thresholds)
     if not all(map(math.isfinite, levels)) or len(set(levels)) < len(levels):
         raise OptionError(f"thresholds={','.join(f'{level:g}' for level in levels)}: give numbers, each once")
@@ -178,8 +291,8 @@ def _grid_of(points: Iterable[Points]) -> int:
     It has `GRID_POINTS` or fewer.
     """
     each = list(points)
-    own = int(each[0].steps[0])
-    if all(np.array_equal(one.steps, own * np.arange(1, len(one.steps) + 1)) for one in each):
+    own = min(int(one.steps[0]) for one in each)
+    if all(np.array_equal(_punctual(one.steps, own), own * np.arange(1, len(one.steps) + 1)) for one in each):
         return own
     least = max(
         *(int(one.steps[0]) for one in each),
@@ -190,24 +303,18 @@ def _grid_of(points: Iterable[Points]) -> int:
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= least)
 
 
-def _first(points: Mapping[Run, Points]) -> int:
-    """Return the step at which every run has begun."""
-    return max(int(own.steps[0]) for own in points.values())
-
-
-def _on_grid(own: Points, every: int, run: Run, instead: str) -> NDArray[np.float64]:
-    """Return the scores at every grid point up to the last observation (T,): each the last at or before it."""
-    of_run, last = f"{own.source}: '{run[0]}', seed {run[1]}", int(own.steps[-1])
+def _on_grid(own: Points, every: int, length: int, run: Run, instead: str) -> NDArray[np.float64]:
+    """Return the scores at the first grid points (T,): each the last at or before it."""
     if own.steps[0] > every:
         raise FileError(
-            f"{of_run} begins at step {own.steps[0]}, after the first grid point at {every}; scores are not carried "
-            f"backward: {instead}"
+            f"{own.source}: '{run[0]}', seed {run[1]} begins at step {own.steps[0]}, after the first grid point at "
+            f"{every}; scores are not carried backward: {instead}"
         )
-    if last < every:
-        raise FileError(f"{of_run} ends at step {last}, before the first grid point at {every}")
-    if last // every > _MOST_GRID_POINTS:
-        raise FileError(f"{of_run} has {last // every:,} grid points: every={math.ceil(last / GRID_POINTS)}")
-    grid = every * np.arange(1, last // every + 1)
+    if length > _MOST_GRID_POINTS:
+        raise FileError(
+            f"{own.source}: {length:,} grid points: every={math.ceil(length * every / GRID_POINTS)}"
+        )
+    grid = every * np.arange(1, length + 1)
     return own.scores[np.searchsorted(own.steps, grid, side="right") - 1]
 
 
@@ -224,18 +331,6 @@ def _require_reachable(
             f"{'below' if below else 'above'} them from its first point on. Write scores as the files have them, which "
             f"lie between {low:g} and {high:g}"
         )
-
-
-def _cut(curves: Mapping[Run, NDArray[np.float64]]) -> dict[Run, NDArray[np.float64]]:
-    """Cut the curves of each entry to the shortest, without curves that end long before the longest.
-
-    Runs that end with an episode differ a little in length, and none should be left out for that.
-    """
-    ends: dict[str, list[int]] = defaultdict(list)
-    for (entry, _), curve in curves.items():
-        ends[entry].append(len(curve))
-    common = {entry: min(end for end in own if end >= _ALIKE * max(own)) for entry, own in ends.items()}
-    return {run: curve[: common[run[0]]] for run, curve in curves.items()}
 
 
 def _new_task(
@@ -329,7 +424,7 @@ def _require_same_options(
 
 
 def _scores(
-    curve: NDArray[np.float64], best: float | None, file: TaskFile, run: Run, source: str
+    curve: NDArray[np.float64], best: float | None, file: TaskFile, run: Run, source: str, every: int
 ) -> NDArray[np.float64]:
     """Return scores in the unit of a task: fractions of the best one where there is one."""
     scores = round_means(curve if best is None or file.ranking.thresholds is not None else curve / best)
@@ -337,15 +432,17 @@ def _scores(
         require_scores(scores, file, Path(source))
     except StoreError:
         low, high = float(curve.min()), float(curve.max())
-        of_best = (
+        worst = int(curve.argmin() if low < 0 else curve.argmax())
+        top = (
             "1, as the task has it (maximum is what counts as 1)"
             if best is None
             else f"{best:g}, the maximum"
         )
-        levels = "thresholds=" + ",".join(f"{part * (best or high):g}" for part in (0.6, 0.75, 0.9))
+        levels = "thresholds=" + ",".join(f"{part * (best or max(high, 1)):g}" for part in (0.6, 0.75, 0.9))
         raise FileError(
-            f"{source}: '{run[0]}', seed {run[1]}: scores from {low:g} to {high:g} are not between 0 and {of_best}: "
-            f"give a new --task thresholds in place of the maximum, which takes any scores: {levels}"
+            f"{source}: '{run[0]}', seed {run[1]}: the score at step {every * (worst + 1)} is {curve[worst]:g}, and "
+            f"scores are not between 0 and {top}. Into a new --task, any scores may come: leave maximum out, and type "
+            f"{levels}"
         ) from None
     return scores
 
@@ -408,6 +505,7 @@ def _write(
     store: EntryStore,
     record: EntryRecord,
     points: Mapping[Run, Points],
+    early: str | None,
 ) -> Imported:
     """Write the seeds of an entry that are not there yet."""
     require_no_link(store.path.parent, store.path)
@@ -425,20 +523,24 @@ def _write(
             store,
             printable(points[entry, min(curves)].source),
             {
-                seed: (curve, functools.partial(_write_seed, curve, record, points[entry, seed]))
+                seed: (curve, functools.partial(_write_seed, curve, record, points[entry, seed], early))
                 for seed, curve in curves.items()
             },
         )
     finally:
         claim.release()
-    lasts = [int(points[entry, seed].steps[-1]) for seed in curves]
-    notes += _notes(entry, curves, lasts, store.seeds(), record.task_file.protocol.interactions)
+    ends = {
+        seed: int(points[entry, seed].steps[-1]) // record.task_file.protocol.interactions for seed in curves
+    }
+    notes += _notes(entry, len(next(iter(curves.values()))), ends, store.seeds(), record, early)
     return Imported(
         store, record.name, record.label, record.task_name, tuple(new), tuple(known), tuple(notes)
     )
 
 
-def _write_seed(curve: NDArray[np.float64], record: EntryRecord, own: Points, made: SeedStore) -> None:
+def _write_seed(
+    curve: NDArray[np.float64], record: EntryRecord, own: Points, early: str | None, made: SeedStore
+) -> None:
     made.path.mkdir(parents=True)
     rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(curve, start=1)]
     write_atomically(made.table, table_bytes(rows))
@@ -461,6 +563,11 @@ def _write_seed(curve: NDArray[np.float64], record: EntryRecord, own: Points, ma
                     "points": len(own.steps),
                     "first_step": int(own.steps[0]),
                     "last_step": int(own.steps[-1]),
+                    **(
+                        {"early": early}
+                        if int(own.steps[-1]) // record.task_file.protocol.interactions < len(curve)
+                        else {}
+                    ),
                 },
                 "provenance": [{"imported_with": provenance.collect([]).versions}],
             }
@@ -493,27 +600,22 @@ def _finite(value: object) -> bool:
 
 def _notes(
     entry: str,
-    curves: Mapping[int, NDArray[np.float64]],
-    lasts: Sequence[int],
+    length: int,
+    ends: Mapping[int, int],
     seeds: Sequence[int],
-    every: int,
+    record: EntryRecord,
+    early: str | None,
 ) -> list[str]:
-    """Return notes for the reader: too few seeds, and runs that end before the others."""
-    notes = []
-    ends = [last // every for last in lasts]
-    if max(ends) > max(map(len, curves.values())):
-        end = max(map(len, curves.values())) * every
-        notes.append(f"'{entry}': all cut to step {end}; the longest goes on to {max(ends) * every}")
+    """Return notes for the reader: too few seeds, and curves that were cut or go on after their last score."""
+    notes, every = [], record.task_file.protocol.interactions
+    if max(ends.values()) > length:
+        last = max(ends.values()) * every
+        notes.append(f"'{entry}': all cut to step {length * every}; the longest goes on to {last}")
+    held = [seed for seed, end in ends.items() if end < length]
+    if early is not None and held:
+        notes.append(f"'{entry}': seeds {format_seeds(held)} end early: {EARLY[early]}")
     if len(seeds) < MIN_RUNS:
         notes.append(f"'{entry}' has {counted(len(seeds), 'seed')}: a verdict needs {MIN_RUNS} of each entry")
-    longest = max(map(len, curves.values()))
-    short = [seed for seed, curve in curves.items() if len(curve) < longest]
-    if short:
-        least = min(map(len, curves.values()))
-        notes.append(
-            f"'{entry}': seeds {format_seeds(short)} end before the others, from step {least * every} on (others at "
-            f"{longest * every}): a board leaves them out where it goes further"
-        )
     return notes
 
 
@@ -521,11 +623,12 @@ def told(done: Sequence[Imported]) -> list[str]:
     """Return the grid and the thresholds of imported entries, in words."""
     record = done[0].store.record()
     file, best = record.task_file, record.maximum
-    grid = "" if record.imported is None else record.imported.grid
+    grid, metric = ("", "") if (own := record.imported) is None else (own.grid, own.metric)
     scale = f"scores over {best:g}; " if best is not None else ""
     levels = ", ".join(f"{level:g}" for level in sorted(file.ranking.grid.thresholds))
     less = f" on {file.score.called}, less is better" if file.score.goal == "below" else ""
     return [
+        *([f"score: {printable(metric)}"] if metric not in ("", "score") else []),
         f"grid: {grid}",
         f"{scale}thresholds {levels}{less}; horizon {file.ranking.horizons[0]} steps",
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
@@ -30,12 +30,15 @@ def import_curves(
     every: int | None = None,
     metric: str | None = None,
     goal: Goal | None = None,
+    early: Literal["solved", "failed", "cut"] | None = None,
+    units: Literal["same"] | None = None,
     runs: str | PathLike[str] = "runs",
 ) -> list[Imported]:
     """Import learning curves that other programs made, as *external* entries to compare.
 
     At every grid point stands the last score at or before it: nothing is interpolated or carried backward, and a curve
-    ends at its last observation. External entries cannot be trained, evaluated or exported for publication.
+    ends at its last observation, unless `early` says otherwise. External entries cannot be trained, evaluated or
+    exported for publication.
 
     Parameters
     ----------
@@ -59,6 +62,11 @@ def import_curves(
         The column of a csv file or a table, or the scalar of TensorBoard, that is the score.
     goal:
         `below` where less of it is better, for a new task with `thresholds`.
+    early:
+        What it means that runs end before the others of their entry: `solved`, their last score holds; `failed`, they
+        reach no threshold from there on; `cut`, every run is cut to the shortest. None refuses such runs.
+    units:
+        `same` if scores or steps of entries that differ tenfold are in one unit. None refuses them.
     runs:
         The results folder.
 
@@ -90,4 +98,6 @@ def import_curves(
         found = points.read_files([Path(fspath(each)) for each in curves], metric)
     else:
         found = points.read_table(curves, metric)
-    return curve_files.import_points(found, Path(runs), task, maximum, thresholds, every, goal, metric)
+    return curve_files.import_points(
+        found, Path(runs), task, maximum, thresholds, every, goal, metric, early, units
+    )

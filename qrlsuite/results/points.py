@@ -29,12 +29,25 @@ from qrlsuite.results.run_files import MOST_POINTS, cells_of, lines_of, whole
 COLUMNS = ("entry", "seed", "step", "score")
 """Columns of a csv file or a table."""
 
-SYNONYMS: dict[str, tuple[str, ...]] = {
-    "entry": ("model", "algorithm", "algo", "agent", "name", "exp_name"),
-    "seed": ("run", "run_id", "trial"),
-    "step": ("steps", "timestep", "timesteps", "total_timesteps", "env_step", "env_steps", "global_step"),
+EPISODES = ("episode", "episodes")
+
+NAMES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "seed": (("seed",), ("run", "run_id", "trial")),
+    "entry": (
+        ("entry",),
+        ("group",),
+        ("exp_name",),
+        ("model", "algorithm", "algo", "agent"),
+        ("name", "run_name", "run"),
+    ),
+    "step": (
+        ("step",),
+        ("steps", "timestep", "timesteps", "total_timesteps", "env_step", "env_steps", "global_step"),
+        EPISODES,
+    ),
+    "score": (("score",), *((name,) for name in run_files.METRICS)),
 }
-"""Other programs' names of these columns. The score has no synonyms: its column is `score`, or the user names it."""
+"""Names of these columns in lower case, ours and other programs'. The first tuple of which a name is there counts."""
 
 Run = tuple[str, int]
 """An entry's name and a seed."""
@@ -54,21 +67,24 @@ class Points:
         (K,) float64, finite.
     source:
         Source of the points, for messages.
+    metric:
+        Name of the score, such as `eval/mean_reward`; empty if unknown.
     """
 
     steps: NDArray[np.int64]
     scores: NDArray[np.float64]
     source: str
+    metric: str = ""
 
 
 class _Rows:
     """Collects points of runs, and refuses points that make no curve."""
 
     def __init__(self) -> None:
-        self._runs: dict[Run, tuple[array.array[int], array.array[float], str]] = {}
+        self._runs: dict[Run, tuple[array.array[int], array.array[float], str, str]] = {}
         self._count = 0
 
-    def add(self, entry: str, seed: int, step: int, score: float, source: str) -> None:
+    def add(self, entry: str, seed: int, step: int, score: float, source: str, metric: str = "") -> None:
         """Add a point."""
         if not math.isfinite(score):
             raise FileError(
@@ -80,19 +96,19 @@ class _Rows:
             raise FileError(f"{source}: more than {MOST_POINTS:,} points: import fewer files at once")
         if (entry, seed) not in self._runs:
             _require_run(entry, seed, source)
-            self._runs[entry, seed] = array.array("q"), array.array("d"), source
-        steps, scores, _ = self._runs[entry, seed]
+            self._runs[entry, seed] = array.array("q"), array.array("d"), source, metric
+        steps, scores, *_ = self._runs[entry, seed]
         steps.append(step)
         scores.append(score)
 
     def points(self) -> dict[Run, Points]:
         """Return the points of every run; one at step 0, before training, is left out."""
         found = {}
-        for (entry, seed), (steps, scores, source) in self._runs.items():
+        for (entry, seed), (steps, scores, source, metric) in self._runs.items():
             at, values = np.array(steps, np.int64), np.array(scores, np.float64)
             _require_increasing(at, f"{source}: '{entry}', seed {seed}")
             if at[-1] > 0:
-                found[entry, seed] = Points(at[at > 0], values[at > 0], source)
+                found[entry, seed] = Points(at[at > 0], values[at > 0], source, metric)
         if not found:
             raise FileError("there is no score after step 0: nothing was imported")
         return found
@@ -132,8 +148,8 @@ def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Po
     Parameters
     ----------
     metric:
-        Name of the score: a column of csv files (default: `score`), a scalar of TensorBoard (default: the first
-        of `run_files.METRICS` in the file).
+        Name of the score: a column of csv files, or a scalar of TensorBoard; by default `score`, or the first of
+        `run_files.METRICS` in the file.
 
     Returns
     -------
@@ -146,9 +162,10 @@ def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Po
             of_runs.append(path)
         else:
             _read_csv(path, rows, metric)
-    for (entry, seed), files in _named(of_runs).items():
-        for step, score in run_files.read(files, metric):
-            rows.add(entry, seed, step, score, str(files[0]))
+    for (entry, seed), files in _named(_by_words(of_runs)).items():
+        name, curve = run_files.read(files, metric)
+        for step, score in curve:
+            rows.add(entry, seed, step, score, str(files[0]), name)
     return rows.points()
 
 
@@ -156,11 +173,34 @@ def _read_csv(path: Path, rows: _Rows, metric: str | None) -> None:
     content = cells_of(path, lines_of(path))
     _, head = next(content, (0, list[str]()))
     names = [name.strip() for name in head]
-    places = [names.index(name) for name in _columns(names, metric, str(path))]
+    wide = _charts(names, metric)
+    wanted = _columns(names, metric, str(path)) if not wide else [_column("step", names)[0]]
+    places = [names.index(name) for name in wanted]
     for line, cells in content:
         if len(cells) != len(names):
             raise FileError(f"{path}, line {line}: {len(cells)} cells, and {len(names)} in the first line")
-        _add_row(rows, [cells[place].strip() for place in places], str(path), f"line {line}")
+        values, where = [cells[place].strip() for place in places], f"line {line}"
+        for place, (entry, seed, name) in wide.items():
+            if score := cells[place].strip():
+                _add_row(rows, [entry, seed, *values, score], str(path), where, name)
+        if not wide and (values[3] or wanted[3] == "score"):  # rows of other metrics lack the score
+            _add_row(rows, values, str(path), where, _measure(wanted))
+
+
+_CHART = re.compile(r"(.+) - ([^ ]+)")
+
+
+def _charts(names: Sequence[str], metric: str | None) -> dict[int, tuple[str, int, str]]:
+    """Return the columns of a chart that W&B exports, `RUN - METRIC`: place -> (entry, seed, metric); else nothing."""
+    found = {place: match for place, name in enumerate(names) if (match := _CHART.fullmatch(name))}
+    wanted = (metric,) if metric is not None else run_files.METRICS
+    charted = next((each for each in wanted if each in {match[2] for match in found.values()}), None)
+    if charted is None or len(_column("step", names)) != 1:
+        return {}
+    runs: dict[tuple[str, ...], list[Path]] = {
+        (match[1],): [Path(str(place))] for place, match in found.items() if match[2] == charted
+    }
+    return {int(str(place)): (*run, charted) for run, [place] in _named(runs).items()}
 
 
 def read_table(table: Any, metric: str | None = None) -> dict[Run, Points]:
@@ -180,11 +220,11 @@ def read_table(table: Any, metric: str | None = None) -> dict[Run, Points]:
             f"curves of type {type(table).__name__}: give files, {{entry: (seeds, points)}}, an Arrow table or a data "
             "frame"
         ) from None
-    wanted, rows, number = list(_columns(arrow.column_names, metric, "the table")), _Rows(), 0
+    wanted, rows, number = _columns(arrow.column_names, metric, "the table"), _Rows(), 0
     for batch in arrow.select(wanted).to_batches(max_chunksize=100_000):
         for values in zip(*(column.to_pylist() for column in batch.columns)):
             number += 1
-            _add_row(rows, values, "the table", f"row {number}")
+            _add_row(rows, values, "the table", f"row {number}", _measure(wanted))
     return rows.points()
 
 
@@ -219,32 +259,51 @@ def read_arrays(curves: Mapping[str, tuple[Iterable[int], ArrayLike]], steps: Ar
     return rows.points()
 
 
-def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str, ...]:
+def _column(column: str, names: Sequence[str], but: Sequence[str] = ()) -> list[str]:
+    """Return the names that may be a column's: one, if it is clear which."""
+    levels = (
+        [name for name in names if name.lower() in level and name not in but] for level in NAMES[column]
+    )
+    return next(filter(None, levels), [])
+
+
+def _columns(names: Sequence[str], metric: str | None, source: str) -> list[str]:
     """Return the names of the four columns."""
-    have = [name.lower() for name in names]
-    found, wrong, several = list[str](), list[str](), list[str]()
-    for column in COLUMNS:
-        wanted = metric if metric is not None and column == COLUMNS[3] else column
-        exact = [name for name in names if name == wanted]
-        alike = exact or [
-            n for n, lower in zip(names, have) if lower == column or lower in SYNONYMS.get(column, ())
-        ]
+    found: dict[str, str] = {}
+    wrong, several = list[str](), list[str]()
+    for column in NAMES:
+        own = metric is not None and column == "score"
+        alike = (
+            [name for name in names if name == metric] if own else _column(column, names, [*found.values()])
+        )
         if len(alike) != 1:
-            wrong.append(wanted)
+            wrong.append(column)
             several += alike
-        found += alike[:1]
+        if alike:
+            found[column] = alike[0]
     if wrong:
         here = listed([ascii(name)[1:-1][:40] for name in names]) or "none"
-        other = "; metric=NAME reads another column as the score" if wrong == [COLUMNS[3]] else ""
+        others = [ascii(name)[1:-1][:40] for name in names if name not in found.values()]
+        other = (
+            f"; type metric=NAME, where NAME is the score: {listed(others)}"
+            if others and wrong == ["score"]
+            else ""
+        )
         which = f"; rename all of {', '.join(several)} but one" if len(set(several)) > 1 else ""
         raise FileError(
             f"{source}: expected the columns {', '.join((*COLUMNS[:3], metric or COLUMNS[3]))}, each once; found {here}"
             f"{which}{other}"
         )
-    return tuple(found)
+    return [found[column] for column in COLUMNS]
 
 
-def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str) -> None:
+def _measure(columns: Sequence[str]) -> str:
+    """Name what curves measure: the column of the score, and of steps where these are episodes."""
+    *_, step, score = columns
+    return f"{score} by {step}" if step.lower() in EPISODES else score
+
+
+def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str, metric: str) -> None:
     """Add a row of four values."""
     for name, value in zip(COLUMNS, values):
         if value is None or value == "":
@@ -259,18 +318,27 @@ def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str) -> Non
         raise FileError(
             f"{source}, {place}: {texts}: seed and step are whole numbers, and the score is a number"
         ) from None
-    rows.add(str(entry).strip(), *numbers, source)
+    rows.add(str(entry).strip(), *numbers, source, metric)
 
 
-_SEED = re.compile(r".*(?<![a-z])seed[-_ =]*(\d+)(?!\d).*|.*?(\d+)", re.IGNORECASE | re.DOTALL)
+_SEED = re.compile(
+    r".*(?<![a-z])seed[-_ =]*(?P<named>\d+)(?!\d).*|.+__(?P<cleanrl>\d+)__\d{9,}|.*?(?P<last>\d+)",
+    re.IGNORECASE | re.DOTALL,
+)
+"""A run's name with its seed; CleanRL's names are `ENVIRONMENT__NAME__SEED__TIME`."""
 _BEFORE = re.compile(r"[-_ =.]*(seed|run)?[-_ =.]*$", re.IGNORECASE)
 
 
-def _named(paths: Sequence[Path]) -> dict[Run, list[Path]]:
-    """Return files by the run that they are of."""
+def _by_words(paths: Sequence[Path]) -> dict[tuple[str, ...], list[Path]]:
+    """Return files by the words that name their run."""
     of_folders: dict[tuple[str, ...], list[Path]] = defaultdict(list)
     for path in paths:
         of_folders[run_files.words(path)].append(path)
+    return of_folders
+
+
+def _named(of_folders: Mapping[tuple[str, ...], list[Path]]) -> dict[Run, list[Path]]:
+    """Return files by the run that they are of."""
     words_of: dict[tuple[str, ...], tuple[list[str], int]] = {}
     for key, files in of_folders.items():
         *above, run = key
@@ -280,7 +348,7 @@ def _named(paths: Sequence[Path]) -> dict[Run, list[Path]]:
                 f"{files[0]}: which seed is '{ascii(run)[1:-1]}'? Call the folders of runs ENTRY/seed-0, ENTRY/seed-1, "
                 f"..., or write a csv file with the columns {','.join(COLUMNS)}"
             )
-        group = 1 if found[1] else 2
+        group = found.lastgroup or 0
         words_of[key] = [*above, _BEFORE.sub("", run[: found.start(group)])], int(found[group])
     return _by_difference(of_folders, words_of)
 

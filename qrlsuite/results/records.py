@@ -207,10 +207,13 @@ class Provenance(Record):
 
 
 class ImportedRecord(Record):
-    """From what curves of another program were made."""
+    """From what curves of another program were made, and the scale of the first of them in the files' units."""
 
     grid: str = ""
     maximum: Number | None = None
+    metric: str = ""
+    largest: Number | None = None
+    last_step: Count | None = None
 
 
 def _told(imported: Any) -> Any:

@@ -23,9 +23,13 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import FileError, listed
 
-METRICS = ("eval/mean_reward", "rollout/ep_rew_mean", "charts/episodic_return", "score")
-"""Names of the score in Stable-Baselines3's evaluations and training, and in CleanRL. If the user names no scalar, the
-first of these names in a file is read."""
+EVALUATED, TRAINED = "eval/mean_reward", "rollout/ep_rew_mean"
+METRICS = ("validation/score", EVALUATED, TRAINED, "charts/episodic_return", "score")
+"""Names of the score in this suite's trackers, in Stable-Baselines3's evaluations and training, and in CleanRL. If the
+user names no scalar, the first of these names in a file is read."""
+
+WHILE_TRAINING = (TRAINED, "charts/episodic_return")
+"""Returns of agents that still explore, which are not compared with scores of validations."""
 
 MOST_BYTES = 1_000_000_000
 """Bytes of a file that is read at once, packed or unpacked, at most."""
@@ -99,8 +103,8 @@ def words(path: Path) -> tuple[str, ...]:
     return (*run.parent.parts[1:], run.name)
 
 
-def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
-    """Read the files of one run.
+def read(paths: Sequence[Path], metric: str | None = None) -> tuple[str, Curve]:
+    """Read the files of one run: the name of the score, and its curve.
 
     Parameters
     ----------
@@ -112,12 +116,13 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
     if len(kinds) > 1 or reader is None or (reader is _evaluations and len(paths) > 1):
         names = listed([path.name for path in paths])
         raise FileError(f"{paths[0].parent}: {names} are of one run: name one of them")
-    if metric is not None and reader in (_monitor, _evaluations):
-        raise FileError(f"{paths[0]}: metric={metric}: {paths[0].name} has one score")
+    only = TRAINED if reader is _monitor else EVALUATED if reader is _evaluations else metric
+    if metric not in (None, only):
+        raise FileError(f"{paths[0]}: metric={metric}: {paths[0].name} has one score, {only}")
     return reader(paths, metric)
 
 
-def _kind(path: Path) -> Callable[[Sequence[Path], str | None], Curve] | None:
+def _kind(path: Path) -> Callable[[Sequence[Path], str | None], tuple[str, Curve]] | None:
     """Return the reader of a file of one run, None for any other file."""
     name = path.name
     if ".tfevents." in name:
@@ -162,7 +167,11 @@ def cells_of(path: Path, lines: Iterable[str]) -> Iterator[tuple[int, list[str]]
         raise FileError(f"{path}, line {reader.line_num}: {error}") from None
 
 
-def _monitor(paths: Sequence[Path], metric: str | None) -> Curve:
+def _monitor(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
+    return TRAINED, _recent(paths)
+
+
+def _recent(paths: Sequence[Path]) -> Curve:
     """Yield the mean return of the last episodes at the end of each; episodes of several environments by their time."""
     episodes = [episode for path in paths for episode in _episodes(path)]
     episodes.sort(key=lambda episode: episode[0])  # stable: those of one environment keep their order
@@ -200,7 +209,7 @@ def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
         yield episode
 
 
-def _progress(paths: Sequence[Path], metric: str | None) -> Curve:
+def _progress(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
     """Return a scalar from a csv file of Stable-Baselines3's logger; a row may lack some scalars."""
     found: dict[str, dict[int, float]] = {}
     for path in paths:
@@ -220,7 +229,7 @@ def _progress(paths: Sequence[Path], metric: str | None) -> Curve:
     return _chosen(found, metric, paths[0])
 
 
-def _evaluations(paths: Sequence[Path], metric: str | None) -> Curve:
+def _evaluations(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
     """Return the mean return of the episodes of each evaluation."""
     path = paths[0]
     steps, results = (_npz_array(path, name) for name in ("timesteps", "results"))
@@ -231,7 +240,7 @@ def _evaluations(paths: Sequence[Path], metric: str | None) -> Curve:
         )
     if steps.dtype.kind not in "iu" or results.dtype.kind not in "iuf":
         raise FileError(f"{path}: timesteps are {steps.dtype} and results {results.dtype}; expected numbers")
-    return zip(steps.tolist(), results.astype(np.float64).mean(axis=1).tolist())
+    return EVALUATED, zip(steps.tolist(), results.astype(np.float64).mean(axis=1).tolist())
 
 
 def _npz_array(path: Path, name: str) -> NDArray[Any]:
@@ -266,7 +275,7 @@ def _require_size(stream: io.BytesIO, length: int, source: str) -> None:
         raise FileError(f"{source} does not have the bytes of an array of shape {shape}")
 
 
-def _tensorboard(paths: Sequence[Path], metric: str | None) -> Curve:
+def _tensorboard(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
     """Return a scalar of event files; the last written value of a step counts."""
     if importlib.util.find_spec("tensorboard") is None:
         raise FileError(f"{paths[0]}: to read it, pip install 'qrlsuite[tensorboard]'")
@@ -306,10 +315,10 @@ def _collect(
         raise FileError(f"{path}: more than {MOST_POINTS:,} points or 10,000 scalars")
 
 
-def _chosen(found: Mapping[str, Mapping[int, float]], metric: str | None, path: Path) -> Curve:
-    """Return the score's values by step."""
+def _chosen(found: Mapping[str, Mapping[int, float]], metric: str | None, path: Path) -> tuple[str, Curve]:
+    """Return the score's name, and its values by step."""
     name = metric or next((name for name in METRICS if found.get(name)), "")
     if not found.get(name):
         here = listed([ascii(each)[1:-1][:60] for each in sorted(found)]) or "none"
         raise FileError(f"{path}: name the scalar that is the score with metric=NAME; found {here}")
-    return sorted(found[name].items())
+    return name, sorted(found[name].items())

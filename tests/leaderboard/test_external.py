@@ -86,22 +86,79 @@ def test_a_grid_is_round_where_every_run_has_begun(tmp_path: Path) -> None:
     assert a.store.seed(0).read().curve.tolist() == [1, 1, 1, 1, 2, 2, 2]
 
 
-def test_runs_of_different_length_are_named(tmp_path: Path) -> None:
+def test_runs_that_end_early_are_what_the_user_says(tmp_path: Path) -> None:
+    """Without the fast runs that were stopped, or the slow ones that crashed, a verdict is wrong."""
+    path = ending(tmp_path / "curves.csv", 30, 30, 20, 0)
+    path.write_text(path.read_text() + "a,3,7,18\n")  # before the first grid point
+
+    def take(early: Any = None) -> tuple[list[list[float]], tuple[str, ...]]:
+        [a] = api.import_curves(path, thresholds=[15], early=early, every=10, runs=tmp_path / f"runs-{early}")
+        return [a.store.seed(seed).read().curve.tolist() for seed in range(4)], a.notes
+
+    said = r"seeds 2:4 of 'a' from step 0 on, others at 30\. Type early=solved if they"
+    with pytest.raises(QrlSuiteError, match=said):
+        take()
+    whole = [[10, 20, 30], [11, 21, 31]]
+    assert take("solved")[0] == [*whole, [12, 22, 22], [18, 18, 18]]
+    curves, notes = take("failed")
+    assert curves == [*whole, [12, 22, 10], [10, 10, 10]], "the worst score, at which no threshold is reached"
+    assert "'a': seeds 2:4 end early: they crashed or never learned" in notes[0]
+    record = api.load("a", runs=tmp_path / "runs-failed").records[3].record
+    assert record is not None
+    assert record.imported["early"] == "failed"
+    with pytest.raises(QrlSuiteError, match=r"a run of 'a' ends at step 20, .*: type every=20"):
+        api.import_curves(ending(path, 30, 20), thresholds=[15], every=40, runs=tmp_path)
+    with pytest.raises(OptionError, match="early=died: write solved or failed or cut"):
+        take("died")
+
+
+def test_all_runs_are_cut_at_a_common_horizon(tmp_path: Path) -> None:
     path = ending(tmp_path / "curves.csv", 30, 30, 20)
-    [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
-    assert "seeds 2:3 end before the others, from step 20 on (others at 30)" in a.notes[1]
-    assert a.store.record().task_file.ranking.horizons == [30]
-    assert api.load("a", runs=tmp_path / "runs").left_out == (2,)
+    path.write_text(path.read_text() + "".join(f"b,0,{step},{step}\n" for step in (10, 20, 30, 40)))
+    done = api.import_curves(path, thresholds=[15], early="cut", runs=tmp_path / "runs")
+    assert [api.load(name, runs=tmp_path / "runs").curves.shape for name in "ab"] == [(3, 2), (1, 2)]
+    assert done[1].notes[0] == "'b': all cut to step 20; the longest goes on to 40"
+    with pytest.raises(QrlSuiteError, match=r"seeds 4:5 of 'a' from step 10 on, others at 20"):
+        api.import_curves(ending(path, 0, 0, 0, 0, 10), runs=tmp_path / "runs")  # beside those of before
 
 
 def test_runs_that_end_a_little_apart_are_cut_to_one_length(tmp_path: Path) -> None:
     """Episodes end where they end: no seed is left out for that."""
-    path = ending(tmp_path / "curves.csv", 200, 190, 180, 100)
+    path = ending(tmp_path / "curves.csv", 200, 190, 180)
     [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
     assert a.notes[0] == "'a': all cut to step 180; the longest goes on to 200"
     entry = api.load("a", runs=tmp_path / "runs")
-    assert (entry.curves.shape, entry.seeds, entry.left_out) == ((3, 18), (0, 1, 2), (3,))
+    assert (entry.curves.shape, entry.seeds) == ((3, 18), (0, 1, 2))
     assert a.store.record().task_file.ranking.horizons == [180]
+
+
+def test_one_score_for_all_entries(sb3: Path, tmp_path: Path) -> None:
+    """Evaluations of one agent against training returns of the other: 66 percent fewer steps between equals."""
+    one, other = sb3 / "small" / "seed-3" / "evaluations.npz", sb3 / "large" / "seed-3" / "monitor.csv"
+    said = "score of 'large' is rollout/ep_rew_mean, that of 'small' eval/mean_reward: curves of different scores"
+    with pytest.raises(QrlSuiteError, match=said):
+        api.import_curves([one, other], maximum=500, units="same", runs=tmp_path)
+    [small] = api.import_curves([one], maximum=500, runs=tmp_path)
+    assert small.store.record().imported.metric == "eval/mean_reward"  # type: ignore[union-attr]
+    with pytest.raises(QrlSuiteError, match="that of 'external small', imported before, eval/mean_reward"):
+        api.import_curves([other], runs=tmp_path)
+    with pytest.raises(QrlSuiteError, match="task 'cartpole' a validation without exploration"):
+        api.import_curves([other], task="cartpole", runs=tmp_path)
+
+
+def test_scales_that_differ_tenfold(tmp_path: Path) -> None:
+    def take(scores: dict[str, float], by: int = 1, **options: Any) -> None:
+        curves = {entry: ([0], [[best / 4, best / 2, best]]) for entry, best in scores.items()}
+        api.import_curves(curves, steps=[10 * by, 20 * by, 30 * by], runs=tmp_path, **options)
+
+    same = ": if they are in one unit, type units=same; if not, write one unit in all files"
+    with pytest.raises(QrlSuiteError, match="the largest score of 'b' is 500, that of 'a' 0.9" + same):
+        take({"a": 0.9, "b": 500}, maximum=500)
+    take({"a": 60, "b": 500}, maximum=500)
+    with pytest.raises(QrlSuiteError, match="step of 'c' is 3000, that of 'external a', imported before, 30"):
+        take({"c": 500}, by=100)
+    take({"c": 0.9}, units="same")
+    take({"d": 500})  # as was said before
 
 
 def test_scores_and_grid_of_a_task_of_the_suite(tmp_path: Path) -> None:
@@ -127,8 +184,9 @@ def test_more_seeds_are_added_and_those_here_stay(tmp_path: Path) -> None:
     assert (more.new, more.known) == ((1,), (0,))
     assert "seeds 0:1 have other curves in " in more.notes[0]
     assert f" than in {more.store.path}: these stay, until `qrlsuite runs rm` removes" in more.notes[0]
-    longer = api.import_curves({"a": ([0], [[1, 2, 3, 4]])}, steps=[10, 20, 30, 40], runs=tmp_path)[0]
-    assert (longer.new, api.load("a", runs=tmp_path).records[0].epochs) == ((0,), 4), "the longer curve wins"
+    longer = {"a": ([0, 1], [[1, 2, 3, 4], [2, 3, 4, 5]])}
+    [after] = api.import_curves(longer, steps=[10, 20, 30, 40], runs=tmp_path)
+    assert (after.new, api.load("a", runs=tmp_path).records[0].epochs) == ((0, 1), 4), "the longer curve wins"
     for options, message in (
         ({"maximum": 20}, "task 'external' has 10; give this one another --task NAME"),
         ({"thresholds": [5]}, "task 'external' has 6, 7, 8, 9; leave them out"),
@@ -164,7 +222,7 @@ BAD = {
         "expected the columns entry, seed, step, score, each once; found name, seed",
     ),
     "two steps": ("entry,seed,steps,timesteps,score\n", "rename all of steps, timesteps but one"),
-    "no score": ("entry,seed,step,r\n", "metric=NAME reads another column as the score"),
+    "no score": ("entry,seed,step,r\n", "type metric=NAME, where NAME is the score: r"),
     "empty": ("", "found none"),
     "no rows": (GOOD, "there is no score after step 0"),
     "only before training": (GOOD + "a,0,0,1\n", "there is no score after step 0"),
@@ -176,7 +234,10 @@ BAD = {
     "a long name": (GOOD + "a" * 81 + ",0,10,1\n", "1 to 80 characters"),
     "a long line": (GOOD + "a" * run_files._LONGEST_LINE, "a line of it has 1,000,000 characters"),
     "copies": (lines([(s, t, t) for s in (0, 1) for t in (1, 2, 3)]), "seeds 0 and 1 of 'a' have the same"),
-    "below 0": (GOOD + "a,0,10,-1\n", "scores from -1 to -1 are not between 0 and 100, the maximum"),
+    "below 0": (
+        GOOD + "a,0,10,-1\n",
+        "at step 10 is -1, and .* leave maximum out, and type thresholds=60,75,90",
+    ),
 }
 
 
@@ -216,14 +277,39 @@ def test_thresholds_and_scores_are_rounded_alike(tmp_path: Path) -> None:
     ]
 
 
-def test_columns_may_have_their_usual_other_names(tmp_path: Path) -> None:
+COLUMNS = {
+    "Model,run,global_step,charts/episodic_return": "a,1,10,3",
+    "run,seed,global_step,charts/episodic_return": "a,1,10,3",
+    "group,run_name,seed,Step,validation/score,loss": "a,a_1,1,10,3,7",
+    "exp_name,run_name,seed,episode,score": "a,x__a__1__1700000000,1,10,3",
+    "Step,a_1 - rollout/ep_rew_mean,a_1 - rollout/ep_rew_mean__MIN,a_2 - rollout/ep_rew_mean": "10,3,0,",
+    "global_step,x__a__1__1700000000 - charts/episodic_return": "10,3",
+}
+
+
+@pytest.mark.parametrize("columns", COLUMNS)
+def test_columns_may_have_their_usual_other_names(columns: str, tmp_path: Path) -> None:
     path = tmp_path / "curves.csv"
-    path.write_text("Model,run,global_step,reward\n" + "a,0,10,1\na,0,20,2\na,1,10,2\na,1,20,3\n")
-    with pytest.raises(QrlSuiteError, match="metric=NAME reads another column as the score"):
-        api.import_curves(path, maximum=4, runs=tmp_path)
-    [a] = api.import_curves(path, maximum=4, metric="reward", runs=tmp_path)
-    assert (a.label, a.new) == ("external a", (0, 1))
-    assert a.store.seed(1).read().curve.tolist() == [0.5, 0.75]
+    path.write_text(f"{columns}\n{COLUMNS[columns]}\n")
+    [((entry, seed), own)] = points.read_files([path]).items()
+    assert (entry.rpartition("__")[2], seed, own.steps.tolist(), own.scores.tolist()) == ("a", 1, [10], [3])
+    assert own.metric.partition(" by ")[0] in columns
+
+
+def test_curves_of_racetraq_as_they_are_published(qrlsuite: Callable[..., Any]) -> None:
+    """Eight real runs each, as their author wrote them; some evaluations are one or two episodes late.
+
+    Numbers of `data/studies/chicane_4q/cells.json` in github.com/JanLahmann/racetraQ, commit a9f936f (Apache-2.0,
+    doi 10.5281/zenodo.23270600), copied one by one into csv.
+    """
+    path = Path(__file__).with_name("racetraq_chicane_4q.csv")
+    assert "type metric=NAME, where NAME is the score: lapped_share, mean_return" in refused("import", path)
+    said = qrlsuite("import", path, "metric=lapped_share", "maximum=1").stdout
+    assert "score: lapped_share by episode\ngrid: every 50 steps" in said
+    shares = {entry: api.load(entry).curves for entry in ("quantum base", "mlp")}
+    assert {entry: curves.shape for entry, curves in shares.items()} == dict.fromkeys(shares, (8, 16))
+    assert [round(float(curves[:, -1].mean()), 4) for curves in shares.values()] == [0.3854, 0.9792]
+    assert "quantum base needs" in qrlsuite("compare", "quantum base", "mlp").stdout
 
 
 def test_a_copy_of_a_seed_that_was_imported_before_is_refused(tmp_path: Path) -> None:

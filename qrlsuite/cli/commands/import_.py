@@ -31,7 +31,8 @@ def import_entries(
             "Stable-Baselines3, event files of TensorBoard. Options of files: maximum=BEST, the best "
             "possible score: scores become fractions of it; metric=NAME, the column or scalar that is the score; "
             "for a new task thresholds=A,B,..., scores that count as reached, goal=below where less is better, and "
-            "every=STEPS between grid points.",
+            "every=STEPS between grid points. Where `import` asks for it: early=solved, early=failed or early=cut of "
+            "runs that end before the others; units=same where scales differ tenfold.",
         ),
     ],
     task: Annotated[
@@ -124,5 +125,7 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "every": int,
     "metric": str,
     "goal": str,
+    "early": str,
+    "units": str,
 }
 """Options of files, by name, and how they are read."""
