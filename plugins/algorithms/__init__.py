@@ -97,8 +97,8 @@ def unusable_ddqn(own: Mapping[str, Any], epochs: int, rounds: int, environments
     steps = epochs * rounds
     return [
         *_copies(own["target_steps"], steps),
-        *_beyond("epsilon_steps", own["epsilon_steps"] or 0, steps * environments // 2, HALF),
-        *_stops(own["decay_steps"], steps * environments),
+        *_beyond("epsilon_steps", own.get("epsilon_steps") or 0, steps * environments // 2, HALF),
+        *_stops(own.get("decay_steps"), steps * environments),
     ]
 
 
@@ -116,7 +116,7 @@ def unusable_ppo(own: Mapping[str, Any], epochs: int, rounds: int, environments:
     samples = rounds * environments
     return [
         *_beyond("batch", own["batch"], samples, "samples of an epoch"),
-        *_stops(own["decay_steps"], epochs * samples),
+        *_stops(own.get("decay_steps"), epochs * samples),
     ]
 
 

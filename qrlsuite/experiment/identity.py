@@ -93,9 +93,18 @@ def of(entry: Entry) -> CodeIdentity:
 
 def plugins(entry: Entry) -> list[own.Source]:
     """Return the plugins by path whose code makes an entry's numbers, or watches its training."""
-    needed = _by_path(root for role, each in entry.registered().items() for root in _roots(role, each))
+    roots = [root for role, each in entry.registered().items() for root in _roots(role, each)]
+    made = _environment_id(entry, "environment")
+    if made is not None and (module := _gymnasium_module(made)) is not None:
+        roots.append(module)
+    needed = _by_path(roots)
     watching = {each.distribution for each in registry.load().of(specs.TrackerSpec).values()}
     return [each.source for each in own.loaded() if each.source in needed or each.source.name in watching]
+
+
+def plugin_words(entry: Entry) -> list[str]:
+    """Return the words of a command line that load an entry's plugins: `--plugin ring.py`."""
+    return [word for each in plugins(entry) for word in ("--plugin", str(each.path))]
 
 
 def _roots(role: str, each: registry.Registered[specs.NumericSpec]) -> list[str]:

@@ -325,9 +325,8 @@ class State(Shown):
             if self._hours(name, 1) is None:
                 task = str(table.task)
                 alike = resolve(task, entry.label).task.name == entry.task.name
-                words = [entry.label if alike else str(table.model), "--task", task]
-                for source in identity.plugins(entry):
-                    words += ["--plugin", str(source.path)]
+                label = entry.label if alike else str(table.model)
+                words = [label, "--task", task, *identity.plugin_words(entry)]
                 yield f"  {command('run', *words, '--seeds', seeds, '--epochs', '3', runs=study.runs)}"
 
 

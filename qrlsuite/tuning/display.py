@@ -9,10 +9,13 @@ from typing import Any
 
 from rich.console import Console
 
+from qrlsuite import specs
 from qrlsuite.engine.display import Bar, Clock
 from qrlsuite.engine.terminal import again
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import Missing
+from qrlsuite.errors import listed
+from qrlsuite.options import field_names, tuned
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
 from qrlsuite.results.text import counted, duration, duration_range, hours_range, hours_text, steps_text
@@ -50,6 +53,12 @@ class TuneDisplay:
                 *(f"  {dimension.name}: {_short(dimension.plain())}" for dimension in search.space),
                 f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
             ]
+            options_class = specs.resolve(base.algorithm.options)
+            if request.grid is None and not request.varied and not tuned(options_class):
+                lines.append(
+                    f"  {base.algorithm.name} marks no option for tuning ({listed(field_names(options_class))}): write "
+                    "--vary 'lr={low=1e-4, high=1e-2, log=true}', or mark it, lr: Annotated[float, Tuned(1e-4, 1e-2)]"
+                )
             self.console.print("\n".join(lines), markup=False)
         cores, known = self.where.workers, [cost for cost in costs if cost is not None]
         if len(known) < len(costs):

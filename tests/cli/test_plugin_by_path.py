@@ -111,3 +111,26 @@ def test_an_environment_a_model_and_an_algorithm_of_one_file_in_processes_of_the
     owners = {part["role"]: part["distribution"] for part in record["code"]["parts"]}
     assert owners == {"environment": "mine.py", "algorithm": "mine.py", "model": "mine.py"}
     assert json.loads((entry / "seed-0000" / "run.json").read_text())["status"] == "finished"
+
+
+def test_an_environment_that_its_file_registers_with_gymnasium_beside_an_algorithm_of_another(
+    folder: Path,
+) -> None:
+    """Neither file refers to the other, and workers, the probe and the next command need both."""
+    (folder / "mine.py").write_text(ALL)
+    (folder / "games.py").write_text(
+        "import gymnasium\n"
+        "from gymnasium.envs.classic_control.cartpole import CartPoleEnv\n\n\n"
+        "class Pole(CartPoleEnv):\n    pass\n\n\n"
+        'gymnasium.register("own/Pole-v0", entry_point=Pole, max_episode_steps=20)\n'
+    )
+    both, entry = ("--plugin=games.py", "--plugin=mine.py", "--task=gym:own/Pole-v0"), "slow mlp width=2"
+    done = qrlsuite("run", entry, *both, "--seeds=2", "--epochs=1", "--engine=command", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (record,) = (json.loads(path.read_text()) for path in folder.glob("runs/*/*/entry.json"))
+    (copies,) = record["plugins"].values()
+    assert sorted(Path(copy).name for copy in copies) == ["games.py", "mine.py"]
+    tuned = qrlsuite("tune", entry, *both, "--seeds=1", "--epochs=1", "--sampler=random trials=1", cwd=folder)
+    assert tuned.returncode == 0, tuned.stderr
+    assert "slow marks no option for tuning (lr): write --vary" in " ".join(tuned.stderr.split())
+    assert f"--plugin {folder / 'games.py'} --plugin {folder / 'mine.py'}" in tuned.stdout

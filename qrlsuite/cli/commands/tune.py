@@ -20,6 +20,7 @@ from qrlsuite.cli.training import (
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment import identity
 from qrlsuite.notation import write_setting
 from qrlsuite.results.survey import garbage
 from qrlsuite.results.text import counted, hours_text, size_text
@@ -176,7 +177,9 @@ def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
         if each.written is None:
             continue
         words = [each.base.model.name, write_setting("preset", str(each.written))]
-        line = command("run", *words, "--task", each.request.task, runs=runs)
+        line = command(
+            "run", *words, "--task", each.request.task, *identity.plugin_words(each.base), runs=runs
+        )
         wide.print(f"next: {line}", markup=False, soft_wrap=True)
     task = searches[0].base.task.name
     kept = sum(item.size for item in garbage(runs / FOLDER, task)[0])
