@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from qrlsuite.api import new_study as new_study
     from qrlsuite.api import play as play
     from qrlsuite.api import plot as plot
+    from qrlsuite.api import power as power
     from qrlsuite.api import read_study as read_study
     from qrlsuite.api import register as register
     from qrlsuite.api import run_study as run_study
@@ -43,8 +44,8 @@ __version__ = "0.1.1"
 
 __all__ = [
     "Circuit", "__version__", "agent", "api", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "hookimpl",
-    "import_curves", "layer", "load", "new_study", "play", "plot", "read_study", "register", "register_environments",
-    "run_study", "table", "train", "tune",
+    "import_curves", "layer", "load", "new_study", "play", "plot", "power", "read_study", "register",
+    "register_environments", "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(__all__) - {
@@ -91,6 +92,10 @@ def __getattr__(name: str) -> object:
         module = importlib.import_module("qrlsuite.api")
         return module if name == "api" else getattr(module, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
 
 
 def register_environments() -> None:

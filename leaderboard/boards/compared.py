@@ -52,6 +52,27 @@ class EntryComparison(Shown, Comparison):
         return self.pair.sentence
 
     @property
+    def sentence(self) -> str:
+        """The verdict."""
+        return self.verdict
+
+    @property
+    def p(self) -> float:
+        """The p value of the verdict; NaN where there are too few seeds for one."""
+        return self.pair.times.p
+
+    @property
+    def difference(self) -> float:
+        """How many more steps the first entry needs than the second, as a share of the second's: -0.2 is 20% fewer."""
+        return float(self.pair.times.difference[0])
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 percent interval of the difference."""
+        _, low, high = self.pair.times.difference
+        return float(low), float(high)
+
+    @property
     def headline(self) -> str:
         """Who is compared with whom cell by cell, and at how many seeds and steps."""
         one, other = self.labels
@@ -62,7 +83,7 @@ class EntryComparison(Shown, Comparison):
     def cells_line(self) -> str:
         """The verdict of the rule for cells of the sample-complexity surface."""
         rule = "the paper's rule" if self.rule == DEFAULT else f"rule '{self.rule}'"
-        return f"by {rule}, cell by cell: {self.sentence}"
+        return f"by {rule}, cell by cell: {super().sentence}"
 
     @property
     def further(self) -> list[str]:
@@ -79,6 +100,7 @@ class EntryComparison(Shown, Comparison):
         """Return the comparison as plain values, for JSON: the cells, and `verdict` and `times` beside them."""
         return {
             **super().as_dict(),
+            "sentence": super().sentence,
             "verdict": self.verdict,
             "times": self.pair.as_dict(),
             "board": None if self.among is None else asdict(self.among),

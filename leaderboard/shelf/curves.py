@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -352,10 +352,18 @@ class EntryResults(Shown):
     @property
     def metrics(self) -> dict[str, NDArray[np.float64]]:
         """Metrics of the environment along the curves by name, (N, T) each; NaN where it measured none."""
-        measured = [self.records[seed].measured for seed in self.seeds]
+        return self._along([self.records[seed].measured for seed in self.seeds])
+
+    @property
+    def training(self) -> dict[str, NDArray[np.float64]]:
+        """Metrics of training along the curves by name, (N, T) each, of entries in a results folder."""
+        runs = [self.records[seed].training for seed in self.seeds]
+        return self._along([{name: np.asarray(own[name], np.float64) for name in own} for own in runs])
+
+    def _along(self, runs: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, NDArray[np.float64]]:
         nothing = np.full(self.epochs, np.nan)
-        names = sorted({name for own in measured for name in own})
-        return {name: np.stack([own.get(name, nothing)[: self.epochs] for own in measured]) for name in names}
+        names = sorted({name for own in runs for name in own})
+        return {name: np.stack([own.get(name, nothing)[: self.epochs] for own in runs]) for name in names}
 
     @property
     def changed_thresholds(self) -> bool:

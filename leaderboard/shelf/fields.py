@@ -123,8 +123,8 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     -------
     pyarrow.Table
         The columns are `FIELDS[rows]`, for entries those of `of_entry`, each option, and each metric (`measured.NAME`,
-        averaged like the row's score); null if an entry lacks it. A column of whole and other numbers is float64, a
-        column of numbers and texts is text; lists are JSON.
+        averaged like the row's score; of epochs `training.NAME`, too); null if an entry lacks it. A column of whole
+        and other numbers is float64, a column of numbers and texts is text; lists are JSON.
     """
     make: dict[Rows, Callable[[EntryResults], dict[str, Sequence[Any] | NDArray[Any]]]] = {
         "entries": _of_entry,
@@ -133,7 +133,8 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     }
     shared = _shared(entries) if rows == "entries" else {}
     options = {name: values for name, (values, _) in shared.items()} | _option_columns(entries)
-    metrics = sorted({name for entry in entries for name in entry.metrics})
+    own_metrics = [_metrics(entry, rows) for entry in entries]
+    metrics = sorted({name for own in own_metrics for name in own})
     fields = FIELDS[rows]
     schema = pyarrow.schema(
         [
@@ -142,7 +143,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
         ]
         + [pyarrow.field(name, values.type, metadata=meta) for name, (values, meta) in shared.items()]
         + [pyarrow.field(name, values.type) for name, values in options.items() if name not in shared]
-        + [pyarrow.field(f"{MEASURED}.{name}", _REAL) for name in metrics]
+        + [pyarrow.field(name, _REAL) for name in metrics]
     )
     parts = []
     for place, entry in enumerate(entries):
@@ -154,7 +155,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
             for each in fields
         ]
         columns += [pyarrow.repeat(column[place], count) for column in options.values()]
-        columns += [_metric(entry, name, rows) for name in metrics]
+        columns += [_metric(entry, own_metrics[place].get(name), rows) for name in metrics]
         parts.append(pyarrow.table(columns, schema=schema))
     return pyarrow.concat_tables(parts) if parts else schema.empty_table()
 
@@ -174,14 +175,21 @@ def _shared(entries: Sequence[EntryResults]) -> dict[str, tuple[pyarrow.Array, d
     return found
 
 
-def _metric(entry: EntryResults, name: str, rows: Rows) -> pyarrow.Array:
+def _metrics(entry: EntryResults, rows: Rows) -> dict[str, NDArray[np.float64]]:
+    """Return metrics of the environment by column, and in rows of epochs those of training."""
+    training = entry.training if rows == "epochs" else {}
+    of_training = {f"training.{name}": values for name, values in training.items()}
+    return {**of_training, **{f"{MEASURED}.{name}": values for name, values in entry.metrics.items()}}
+
+
+def _metric(entry: EntryResults, found: NDArray[np.float64] | None, rows: Rows) -> pyarrow.Array:
     """Return a metric of an entry: of every epoch, of every seed over its last tenth, or the mean over seeds."""
-    values = entry.metrics.get(name, np.full(entry.curves.shape, np.nan))
+    values = np.full(entry.curves.shape, np.nan) if found is None else found
     if rows == "epochs":
         return pyarrow.array(values.ravel(), _REAL, from_pandas=True)
     last = values[:, -last_epochs(values.shape[1]) :].mean(axis=1)
-    found = [*last.tolist(), *[math.nan] * len(entry.left_out)] if rows == "seeds" else [float(last.mean())]
-    return pyarrow.array(np.array(found), _REAL, from_pandas=True)
+    shown = [*last.tolist(), *[math.nan] * len(entry.left_out)] if rows == "seeds" else [float(last.mean())]
+    return pyarrow.array(np.array(shown), _REAL, from_pandas=True)
 
 
 def facts(entry: EntryResults) -> dict[str, Any]:

@@ -181,7 +181,7 @@ class PublishedEntry:
             None,
             diverged,
             self.metrics(row),
-            self.folder,
+            folder=self.folder,
             published=True,
         )
 

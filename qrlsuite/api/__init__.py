@@ -14,6 +14,7 @@
     api.play("mlp width=16").save("episode.gif")
     api.agent("mlp width=16").act(observations)
     api.run_study("width.toml")
+    api.power("mlp width=16")
 
 Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
 from `qrlsuite.errors`; if a message names an option of a command, such as `--task`, the function's argument has that
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from qrlsuite.api.diagnosis import diagnose, diagnose_ansatz
     from qrlsuite.api.entries import board, compare, load, plot
     from qrlsuite.api.external import import_curves
+    from qrlsuite.api.needs import power
     from qrlsuite.api.own import register
     from qrlsuite.api.playing import agent, play
     from qrlsuite.api.studies import new_study, read_study, run_study
@@ -38,13 +40,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "agent", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "import_curves", "load", "new_study",
-    "play", "plot", "read_study", "register", "run_study", "table", "train", "tune",
+    "play", "plot", "power", "read_study", "register", "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _MODULES = {
     "diagnosis": ("diagnose", "diagnose_ansatz"),
     "entries": ("board", "compare", "load", "plot"),
     "external": ("import_curves",),
+    "needs": ("power",),
     "own": ("register",),
     "playing": ("agent", "play"),
     "studies": ("new_study", "read_study", "run_study"),

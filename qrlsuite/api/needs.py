@@ -81,7 +81,7 @@ class SeedsNeeded(Shown):
             yield Text(f"Fewer than {MIN_RUNS} seeds are a weak pilot: rare failures may be missing from it.")
 
 
-def seeds_needed(
+def power(
     first: str,
     second: str | None = None,
     *,

@@ -62,7 +62,8 @@ def table(
         finite), and these scores and costs of each. Seeds that are not complete have no scores.
 
         Of epochs: `seed`, `epoch` (from 1), `steps` (environment steps at its end), `score` (mean of the validation
-        after it).
+        after it), and of entries in a results folder `training.NAME`: the algorithm's own metrics, such as
+        `training.loss` and `training.return`.
 
         At last every option, such as `model.width`, `algorithm.lr` and `environment.degree`: null where an entry does
         not have it, or has the default of an option that came later; JSON where it is a list. The schema's metadata say

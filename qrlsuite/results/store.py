@@ -246,6 +246,8 @@ class SeedRun:
     measured:
         Metrics of the environment by name: means over each epoch's validation episodes, (T,); NaN where it measured
         none.
+    training:
+        Metrics of training by name, such as the algorithm's losses, (T,).
     folder:
         The entry's folder.
     published:
@@ -260,6 +262,7 @@ class SeedRun:
     clocked: bool | None = False
     diverged: int | None = None
     measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    training: Mapping[str, pyarrow.ChunkedArray] = field(default_factory=dict)
     folder: Path = Path()
     published: bool = False
 
@@ -447,7 +450,14 @@ class SeedStore:
                 measured[inner] = _metric(inner, columns[name], self.path)
         diverged = columns["diverged"].to_pylist() if "diverged" in columns.column_names else []
         first = diverged.index(True) + 1 if True in diverged else None
-        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured, self.path.parent)
+        own = [
+            name
+            for name in columns.column_names
+            if name not in EpochLine.model_fields and name.isidentifier()
+        ]
+        training = {name.removeprefix("train_"): columns[name] for name in own}
+        folder = self.path.parent
+        return SeedRun(self.seed, record, scores, seconds, counts, clocked, first, measured, training, folder)
 
     def _columns(self) -> pyarrow.Table:
         """Return all epochs as columns: of the table, with newer lines behind them."""

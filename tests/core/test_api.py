@@ -50,6 +50,9 @@ def test_training_and_resuming_give_the_bytes_of_the_command_line(
     first = quiet(tiny_task, tmp_path / "python", seeds=2, epochs=1)
     assert first.curves.shape == (2, 1)
     entry = quiet(tiny_task, tmp_path / "python", seeds=[0, 2, 1], epochs=2)
+    of_epochs = api.table("epochs", runs=tmp_path / "python")
+    assert {"training.loss", "training.return"} <= {*of_epochs.column_names}
+    assert of_epochs["training.loss"].null_count < of_epochs.num_rows == 6
     assert entry.curves.shape == (3, 2)
     assert entry.seeds == (0, 1, 2)
     assert capfd.readouterr() == ("", ""), "quiet"

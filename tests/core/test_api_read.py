@@ -16,6 +16,7 @@ import pyarrow.compute
 import pytest
 from rich.console import Console
 
+import qrlsuite
 from qrlsuite import api
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError
 from qrlsuite.experiment import identity
@@ -77,6 +78,19 @@ def test_a_table_is_a_data_frame(small: EntryResults) -> None:
     )
 
 
+def test_a_comparison_is_numbers_and_a_sentence(small: EntryResults, large: EntryResults) -> None:
+    found = api.compare(large, small)
+    low, high = found.interval
+    assert low < found.difference < high < 0 < found.p < 0.05
+    assert f"{-found.difference:.0%} fewer steps" in found.sentence
+    assert found.as_dict()["verdict"] == str(found.sentence)
+
+
+def test_the_first_names_are_for_users() -> None:
+    assert set(dir(qrlsuite)) == set(qrlsuite.__all__) >= {"compare", "power"}
+    assert "power" in dir(api)
+
+
 def test_a_board_ranks_what_it_is_given(small: EntryResults, large: EntryResults) -> None:
     board = api.board("beam6g", entries=[large, "mlp width=16"], **WHERE)
     (section,) = board.sections
@@ -99,7 +113,7 @@ def test_an_entry_with_fewer_seeds_is_one_that_has_these_alone(small: EntryResul
     assert np.array_equal(few.curves, small.curves[[3, 7]])
     assert few.hours == pytest.approx(sum(small.records[seed].hours for seed in (3, 7)))
     assert small.with_seeds("0:20").seeds == small.with_seeds(20).seeds == tuple(range(20))
-    assert api.compare(small.with_seeds(19), small).sentence == "undecided: fewer than 20 seeds"
+    assert api.compare(small.with_seeds(19), small).outcome == "undecided"
     with pytest.raises(OptionError, match="'ddqn mlp width=16' has no complete run of seed 100"):
         small.with_seeds([0, 100])
 
@@ -249,11 +263,31 @@ def test_the_examples_are_right() -> None:
     assert not any(result.failed for result in results)
 
 
-def test_boards_and_comparisons_import_no_torch() -> None:
-    """It takes a second, and nothing is computed with it."""
-    code = (
-        "import sys; from qrlsuite import api; where = dict(task='beam6g', runs='runs', published=True); "
-        "api.board(**where).sheets(explain=True); api.compare('mlp width=64', 'mlp width=16', **where); "
-        "sys.exit('torch' in sys.modules)"
+def test_curves_are_judged_without_torch_pennylane_and_qiskit(tmp_path: Path) -> None:
+    """They take seconds, and nothing is computed with them."""
+    rows = [
+        f"{entry},{seed},{10 * k},{k * by + seed / 9}"
+        for entry, by in (("a", 1), ("b", 1.1))
+        for seed in (0, 1)
+        for k in range(1, 6)
+    ]
+    (tmp_path / "curves.csv").write_text("\n".join(["entry,seed,step,score", *rows]))
+    code = """
+import sys
+from qrlsuite import api
+from qrlsuite.cli import main
+where = dict(task="beam6g", runs="runs", published=True)
+api.board(**where).sheets(explain=True)
+api.compare("mlp width=64", "mlp width=16", **where)
+for words in ("import curves.csv maximum=6", "compare a b", "plot curves", "power a b --draws 20", "leaderboard"):
+    sys.argv = ["qrlsuite", *words.split()]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, words
+sys.exit(", ".join({"torch", "pennylane", "qiskit"} & sys.modules.keys()) or 0)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=False, cwd=tmp_path, capture_output=True, text=True
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert done.returncode == 0, done.stderr

@@ -12,6 +12,7 @@ import pytest
 from qrlsuite import api
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import fields
+from qrlsuite.results.store import table_bytes
 from tests.commands import say
 from tests.conftest import Train
 from tests.leaderboard.test_external import ending
@@ -59,8 +60,12 @@ def test_values_of_several_types_and_what_is_unknown(runs: Path) -> None:
 
 
 def test_seeds_that_are_not_complete_have_no_scores(tmp_path: Path) -> None:
-    path = ending(tmp_path / "curves.csv", 30, 30, 20)
-    api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
+    path = ending(tmp_path / "curves.csv", 30, 30, 30)
+    [done] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
+    shorter, record = done.store.seed(2), done.store.seed(2).record()
+    assert record is not None
+    shorter.write_record(record.changed(epochs=2))
+    shorter.table.write_bytes(table_bytes([{"epoch": 1, "score": 12.0}, {"epoch": 2, "score": 22.0}]))
     found = api.table("seeds", runs=tmp_path / "runs").to_pylist()
     assert [(row["epochs"], row["area"]) for row in found] == [(3, 20), (3, 21), (2, None)]
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.api.needs import seeds_needed
+from qrlsuite import api
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption, entries_here
 from qrlsuite.engine.terminal import table_console
 
@@ -46,7 +46,7 @@ def power(
 
     Example: qrlsuite power "mlp width=64" --task beam6g --published
     """
-    found = seeds_needed(
+    found = api.power(
         first, second, task=task, draws=draws, runs=runs, published=published, progress=not json_output
     )
     if json_output:
