@@ -148,7 +148,7 @@ def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
     """
     by_task: dict[str, list[EntryResults]] = {}
     for entry in entries:
-        if entry.study is None:
+        if entry.study is None and not entry.missing:
             by_task.setdefault(entry.task_hash, []).append(entry)
     counts = [(0, 0)]
     for group in by_task.values():

@@ -18,7 +18,7 @@ from qrlsuite.columns import Column, flat, record
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard.boards import costs
+from qrlsuite.leaderboard.boards import costs, tables
 from qrlsuite.leaderboard.boards.columns import names_text
 from qrlsuite.leaderboard.boards.ranked import learning_curves, of_one_definition, ranking_of
 from qrlsuite.leaderboard.boards.scores import means
@@ -294,10 +294,13 @@ def _on_every_task(
     seen = Counter(labels.values())
     whole, lines = dict[str, Mapping[str, EntryResults]](), list[str]()
     for key, by_task in reached.items():
+        provisional = tables.missing([entry for entry in by_task.values() if entry.missing])
         name = labels[key] if seen[labels[key]] == 1 else f"{labels[key]} {key[:8]}"
         missing = [task for task in tasks if task not in by_task]
         few = [task for task in tasks if task in by_task and len(by_task[task].seeds) < least]
-        if missing:
+        if provisional:
+            lines += provisional
+        elif missing:
             lines.append(f"{name}: no result with these options on {listed(missing)}")
         elif few:
             count = len(by_task[few[0]].seeds)

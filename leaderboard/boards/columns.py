@@ -15,12 +15,11 @@ import numpy as np
 from qrlsuite import registry
 from qrlsuite.columns import Column
 from qrlsuite.errors import PluginError
-from qrlsuite.leaderboard.boards.ranked import learning_curves
+from qrlsuite.leaderboard.boards.ranked import learning_curves, unranked_since
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import hours_text, interval_text, mean_text, score_text, steps_text
 from qrlsuite.specs import NAME
 from qrlsuite.statistics import final_scores, times_below
-from qrlsuite.statistics.compare import TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.boards.steps import Row, Section, TieredRow
@@ -202,7 +201,7 @@ def ranks(section: Section) -> list[Column[Row]]:
             meaning="1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
             "A outperforms B if it needs significantly fewer steps at a threshold, and significantly more at none "
             "(permutation tests, Holm's correction over all pairs of the board, filtered out or not)",
-            hover=lambda row: TOO_FEW if row.time.ranks is None else "",
+            hover=lambda row: unranked_since(row.entry) if row.time.ranks is None else "",
         ),
         _name(section),
         Column("place", lambda row: row.time.place, flat=("time_place",)),

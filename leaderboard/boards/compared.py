@@ -36,6 +36,8 @@ class EntryComparison(Shown, Comparison):
         Notes on the entries, as below a board: those that may turn the verdict first.
     show_cells:
         Whether the cells are shown one by one: a rule was asked for.
+    missing:
+        Sentences about the seeds that were asked for and are not there, or were withdrawn.
     among:
         The pair's verdict on its task's board; None if it was not looked up, or the board has no other entry.
     """
@@ -44,6 +46,7 @@ class EntryComparison(Shown, Comparison):
     pair: PairVerdict
     remarks: tuple[str, ...] = ()
     show_cells: bool = False
+    missing: tuple[str, ...] = ()
     among: OnBoard | None = None
 
     @property
@@ -104,6 +107,7 @@ class EntryComparison(Shown, Comparison):
             "verdict": self.verdict,
             "times": self.pair.as_dict(),
             "board": None if self.among is None else asdict(self.among),
+            **({"missing": self.missing} if self.missing else {}),
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -152,7 +156,10 @@ def compare_entries(
     both = [first, second]
     flattered = [f"{entry.label}: {tables.MARKS['†']}" for entry in both if entry.on_protocol_seeds]
     remarks = (*tables.doubts(both), *flattered, *tables.remarks(both))
-    return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=remarks, show_cells=asked)
+    missing = tuple(tables.missing(both))
+    return EntryComparison(
+        **values, labels=pair.labels, pair=pair, remarks=remarks, show_cells=asked, missing=missing
+    )
 
 
 SYMBOLS = {

@@ -276,7 +276,7 @@ class CostSection:
 
     def ranks(self, row: CostRow) -> tuple[int, int] | None:
         """Return best and worst rank that the decided pairs leave; None for an entry without a rank."""
-        if self.compared is None or row.index is None or len(row.entry.seeds) < MIN_RUNS:
+        if self.compared is None or row.index is None or not self.compared.ranks[row.index].all():
             return None
         best, worst = self.compared.ranks[row.index].tolist()
         return best, worst
@@ -443,4 +443,4 @@ def _along(entry: EntryResults, cost: float, part: float, parts: int) -> Learnin
     """Return curves along the cost: of every part of the budget, the epoch that is being paid for at its end."""
     ends = part * np.arange(1, parts + 1) / cost
     epochs = np.clip(np.ceil(ends - 1e-9).astype(np.int64) - 1, 0, entry.curves.shape[1] - 1)
-    return LearningCurves(entry.curves[:, epochs], 1, entry.name)
+    return LearningCurves(entry.curves[:, epochs], 1, entry.name, not entry.missing)

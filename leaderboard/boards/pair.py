@@ -85,6 +85,8 @@ class PairVerdict:
         Name of the final score: `score`, or the metric's name.
     before:
         The side of a threshold where a run has not reached it: `below`, or `above`.
+    provisional:
+        Whether seeds that were asked for are missing.
     """
 
     labels: tuple[str, str]
@@ -96,13 +98,15 @@ class PairVerdict:
     whole: int = 0
     score_name: str = "score"
     before: str = "below"
+    provisional: bool = False
 
     @property
     def sentence(self) -> str:
-        """The verdict, its size and how sure it is; of shorter runs than the task asks for, it begins with that."""
-        if self.times.horizon >= self.whole:
-            return self.said
-        return f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {self.said}"
+        """The verdict, its size and how sure it is; if seeds are missing or runs shorter than asked, it begins so."""
+        said = self.said
+        if self.times.horizon < self.whole:
+            said = f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {said}"
+        return f"provisional: {said}" if self.provisional else said
 
     @property
     def said(self) -> str:
@@ -116,9 +120,8 @@ class PairVerdict:
             )
         match pair.direction:
             case Direction.UNDECIDED:
-                return (
-                    f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); so far {self._not_told_apart}"
-                )
+                few = f"fewer than {MIN_RUNS} seeds" if min(pair.n_runs) < MIN_RUNS else "seeds are missing"
+                return f"undecided: {few} ({self._seeds}); so far {self._not_told_apart}"
             case Direction.NOT_TOLD_APART:
                 return f"not told apart: {self._not_told_apart} ({self._seeds}, {self._p})"
             case Direction.TRADE_OFF:
@@ -282,6 +285,7 @@ def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: flo
         whole=min(ranking_of([first, second]).horizons),
         score_name=first.task_file.score.called,
         before=grid.before,
+        provisional=bool(first.missing or second.missing),
     )
 
 
@@ -315,7 +319,7 @@ def on_board(
         if entry.study or entry.task_hash != first.task_hash or end % entry.steps_per_epoch:
             continue
         reached = entry.reaching(end // entry.steps_per_epoch)
-        if reached is not None and len(reached.seeds) >= MIN_RUNS:
+        if reached is not None and len(reached.seeds) >= MIN_RUNS and not reached.missing:
             ranked.append(reached)
     places = [entry.folder for entry in ranked]  # a board calls one of two copies another name
     pair = first.folder, second.folder

@@ -21,6 +21,7 @@ from qrlsuite.statistics import (
     sample_complexity,
     unsettled,
 )
+from qrlsuite.statistics.compare import TOO_FEW
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,12 @@ class Complexity:
 
 def learning_curves(entry: EntryResults) -> LearningCurves:
     """Return an entry's curves as the statistics take them."""
-    return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
+    return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name, not entry.missing)
+
+
+def unranked_since(entry: EntryResults) -> str:
+    """Return why a board ranks an entry no better: its seeds are missing, or too few."""
+    return "provisional: seeds are missing" if entry.missing else TOO_FEW
 
 
 WITH_LOOKS = (

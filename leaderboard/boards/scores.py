@@ -49,7 +49,7 @@ class ScoreSection:
     n_last:
         Number of epochs in a final score, a mean.
     unranked:
-        Labels of the entries with fewer than 20 seeds.
+        The entries with fewer than 20 seeds, or with missing seeds.
     of:
         Name of the numbers: `score`, or the metric's name.
     sign:
@@ -65,7 +65,7 @@ class ScoreSection:
     entries: tuple[EntryResults, ...]
     results: ScoreBoard
     n_last: int
-    unranked: tuple[str, ...]
+    unranked: tuple[EntryResults, ...]
     shown: frozenset[str] | None = None
     of: str = "score"
     sign: int = 1
@@ -141,10 +141,12 @@ class ScoreSection:
             f"P: probability that a seed {'scores more' if self.sign > 0 else 'has less'} than one of the next entry, "
             "ties one half",
         ]
+        few = [entry.label for entry in self.unranked if len(entry.seeds) < MIN_RUNS]
         return [
             *tables.doubts(self.entries),
+            *tables.missing(self.unranked),
             *lines,
-            *([f"fewer than {MIN_RUNS} seeds: {', '.join(self.unranked)}"] if self.unranked else []),
+            *([f"fewer than {MIN_RUNS} seeds: {', '.join(few)}"] if few else []),
             *tables.remarks(self.entries),
         ]
 
@@ -183,7 +185,8 @@ class ScoreSection:
                 [None if math.isnan(p) else float(p) for p in row] for row in results.adjusted[square]
             ],
             "better": results.better[square].tolist(),
-            "unranked": list(self.unranked),
+            "unranked": [entry.label for entry in self.unranked],
+            **({"missing": lines} if (lines := tables.missing([*self.entries, *self.unranked])) else {}),
         }
 
 
@@ -220,9 +223,10 @@ def rank_by_score(
     score, costs = entries[0].task_file.score, entries[0].task_file.ranking.costs
     if by not in OF_RUNS and by not in costs:
         raise OptionError(f"--by {by}: expected {' or '.join([*OF_RUNS, *costs])}")
-    ranked = tuple(entry for entry in entries if len(entry.seeds) >= MIN_RUNS)
+    ranked = tuple(entry for entry in entries if len(entry.seeds) >= MIN_RUNS and not entry.missing)
     if not ranked:
-        raise OptionError(f"--by {by}: no entry has {MIN_RUNS} seeds")
+        lines = tables.missing(entries) or [f"no entry has {MIN_RUNS} seeds"]
+        raise OptionError(f"--by {by}: {'; '.join(lines)}")
     values = [each.curves if by in OF_RUNS else _measured(each, by) for each in ranked]
     curves = [
         LearningCurves(of_runs, each.steps_per_epoch, each.label).cut(horizon)
@@ -237,7 +241,7 @@ def rank_by_score(
         entries=ranked,
         results=compare_scores({str(k): number(each) for k, each in enumerate(curves)}, alpha),
         n_last=last_epochs(curves[0].values.shape[1]),
-        unranked=tuple(entry.label for entry in entries if len(entry.seeds) < MIN_RUNS),
+        unranked=tuple(entry for entry in entries if entry not in ranked),
         of=score.called if by in OF_RUNS else by,
         sign=score.sign if by in OF_RUNS else -1,
     )

@@ -18,19 +18,19 @@ import numpy as np
 from qrlsuite.columns import Column, flat, record
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection, ScoreSection, digest
-from qrlsuite.leaderboard.boards import columns
+from qrlsuite.leaderboard.boards import columns, tables
 from qrlsuite.leaderboard.boards.ranked import (
     Complexity,
     complexity_at,
     learning_curves,
     ranking_of,
     rule_of,
+    unranked_since,
 )
 from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow, rank_by_time
 from qrlsuite.leaderboard.rules import TIMES
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, last_epochs, outperformance
-from qrlsuite.statistics.compare import TOO_FEW
+from qrlsuite.statistics import Board, SignificanceRule, last_epochs, outperformance
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,9 @@ class TieredRow(Row):
             return ""
         if self.not_reached:
             return "not reached: at the cap in every cell, and not ranked among each other"
-        return TOO_FEW if len(self.entry.seeds) < MIN_RUNS else "undecided: nothing to compare with"
+        if self.time.ranks is None:
+            return unranked_since(self.entry)
+        return "undecided: nothing to compare with"
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,7 @@ class Section:
             "provisional": self.provisional,
             "cell": self.ranking.cell,
             "rule": self.rule,
+            **({"missing": lines} if (lines := tables.missing(self.entries)) else {}),
             **({"policies": dict(self.ranking.policies)} if self.ranking.policies else {}),
             "times": {**self.times.as_dict(), "entries": [record(of_ranks, row) for row in self.rows]},
             "rows": [record(of_tiers, row) for row in self.tiers],

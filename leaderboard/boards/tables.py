@@ -21,7 +21,7 @@ from qrlsuite.results.text import (
     steps_text,
 )
 from qrlsuite.statistics import Direction
-from qrlsuite.statistics.compare import TOO_FEW
+from qrlsuite.statistics.compare import MIN_RUNS, TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.boards.steps import Section
@@ -144,7 +144,7 @@ def _rank_notes(section: Section) -> list[str]:
         if times.n_pairs
         else "no pair to test"
     )
-    few = any(row.time.ranks is None for row in section.rows)
+    few = any(len(row.entry.seeds) < MIN_RUNS for row in section.rows)
     return [
         f"rank: by significant outperformance: {pairs}",
         *[TOO_FEW] * few,
@@ -241,10 +241,29 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
             for sentence in dict.fromkeys(line for entry in entries for line in entry.unusable)
         },
         "unfinished seeds, left out": {
-            entry.label: format_seeds(entry.left_out) for entry in entries if entry.left_out
+            entry.label: format_seeds(entry.left_out)
+            for entry in entries
+            if set(entry.left_out) - {*entry.missing}
         },
     }
-    return [*_listed(notes), *_edited(entries), *changed_thresholds(entries)]
+    return [*missing(entries), *_listed(notes), *_edited(entries), *changed_thresholds(entries)]
+
+
+def missing(entries: Sequence[EntryResults]) -> list[str]:
+    """Name the seeds that were asked for and are not there, with what to do, and the requests that were withdrawn."""
+    notes = {
+        "provisional, unranked until these seeds are trained (`qrlsuite run`) or withdrawn (`qrlsuite runs rm ENTRY "
+        "--seeds`)": {entry.label: entry.missing_text for entry in entries if entry.missing},
+        "seeds that were asked for, and withdrawn": {
+            entry.label: "; ".join(
+                f"{format_seeds([seed for seed, why in entry.withdrawn.items() if why == reason])}: {reason}"
+                for reason in dict.fromkeys(entry.withdrawn.values())
+            )
+            for entry in entries
+            if entry.withdrawn
+        },
+    }
+    return _listed(notes)
 
 
 def _listed(notes: Mapping[str, Mapping[str, str]]) -> list[str]:

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.leaderboard.boards.columns import ranks_text
+from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import interval_text, percent
 from qrlsuite.statistics import (
-    MIN_RUNS,
     Direction,
     Grid,
-    LearningCurves,
     MeanTime,
     TimesBoard,
     times_board,
@@ -34,15 +33,15 @@ class TimeRow:
     Attributes
     ----------
     place:
-        1 for the smallest M; None below 20 seeds.
+        1 for the smallest M; None below 20 seeds, and where seeds are missing.
     place_at_half:
         The place if all entries had ended at half the horizon.
     ranks:
-        Best and worst rank that the decided pairs leave; None below 20 seeds.
+        Best and worst rank that the decided pairs leave; None without a place.
     at_cap:
         Share of the times, over runs and thresholds, that are the horizon: the run never reached the threshold.
     difference:
-        M over the M of the first shown entry, minus 1, and its interval; None for the first, and below 20 seeds.
+        M over the M of the first shown entry, minus 1, and its interval; None for the first, and without a place.
     few:
         Whether it has fewer than 50 seeds, and another ranked entry has another number of seeds.
     """
@@ -58,7 +57,7 @@ class TimeRow:
 
     @property
     def rank_text(self) -> str:
-        """`3`, `3-5`, or `-` below 20 seeds."""
+        """`3`, `3-5`, or `-` without a place."""
         return "-" if self.ranks is None else ranks_text(self.ranks)
 
     @property
@@ -108,8 +107,8 @@ class TimeRanking:
 
     @property
     def n_ranked(self) -> int:
-        """Entries of 20 seeds or more: the family over whose pairs Holm's procedure goes."""
-        return sum(count >= MIN_RUNS for count in self.board.n_runs)
+        """Entries of 20 seeds or more, none missing: the family over whose pairs Holm's procedure goes."""
+        return int(self.board.ranks.all(axis=1).sum())
 
     def trade_offs(self) -> list[str]:
         """Return a line for every pair in which each entry needs fewer steps at some threshold."""
@@ -212,9 +211,8 @@ def rank_by_time(
     shown:
         Which entries have a row; all are compared, and counted by Holm's procedure. None means all.
     """
-    curves = [LearningCurves(entry.curves, entry.steps_per_epoch, entry.name) for entry in entries]
-    board = times_board(curves, grid, alpha, horizon)
-    ranked = [index for index in board.order if board.n_runs[index] >= MIN_RUNS]
+    board = times_board([learning_curves(entry) for entry in entries], grid, alpha, horizon)
+    ranked = [index for index in board.order if board.ranks[index, 0]]
     order = tuple(index for index in board.order if shown is None or shown(entries[index]))
     at_half = [index for index in board.order_at_half if index in ranked]
     rows = []

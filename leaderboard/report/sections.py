@@ -13,7 +13,7 @@ from qrlsuite.columns import Column
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.boards import columns, tables
 from qrlsuite.leaderboard.boards.pair import pair_on
-from qrlsuite.leaderboard.boards.ranked import ranking_of
+from qrlsuite.leaderboard.boards.ranked import ranking_of, unranked_since
 from qrlsuite.leaderboard.boards.steps import Section
 from qrlsuite.leaderboard.boards.times import TimeRanking
 from qrlsuite.leaderboard.report import ladder, timed
@@ -26,7 +26,6 @@ from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, sy
 from qrlsuite.leaderboard.report.winners import Winners, winners
 from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.statistics import Evidence, Grid, Outcome
-from qrlsuite.statistics.compare import TOO_FEW
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
@@ -174,7 +173,7 @@ def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
     """Return a sentence that names the leading entry among all compared entries."""
     ranked = [row for row in rows if row.time.ranks is not None]
     if not ranked:
-        return f"No entry is ranked: {TOO_FEW.partition(': ')[2]}."
+        return f"No entry is ranked: {unranked_since(rows[0].time.entry).partition(': ')[2]}."
     best, relation = ranked[0], times.board.outperforms
     if times.n_ranked == 1:
         return f"{best.name} is the only ranked entry."

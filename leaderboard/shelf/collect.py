@@ -21,7 +21,7 @@ from qrlsuite.leaderboard.shelf.curves import (
     current,
     require_scores,
 )
-from qrlsuite.results import codes, genuine, lookup, probes
+from qrlsuite.results import codes, genuine, lookup, probes, requests
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import ANOTHER_FOLDER, EntryStore, SeedRun, entries
 from qrlsuite.results.text import counted
@@ -371,9 +371,20 @@ def read_entry(store: EntryStore) -> EntryResults | None:
                 f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.seed} "
                 f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
             )
-    return EntryResults.of(
-        record, store.path, {run.seed: run for run in runs}, mark=store.mark, refused=tuple(refused)
-    )
+    asked = requests.read(store)
+    facts = {
+        "mark": store.mark,
+        "refused": tuple(refused),
+        "asked": asked.asked,
+        "withdrawn": asked.withdrawn,
+    }
+    found = EntryResults.of(record, store.path, {run.seed: run for run in runs}, **facts)
+    for other in store.path.parent.glob(f"{store.name}*") if found.missing else ():
+        there = EntryStore(other).finished(found.asked, found.epochs)
+        if other != store.path and len(there) == len(found.asked):
+            moved = dict.fromkeys(found.missing, f"trained anew, by another code ({other.name})")
+            return replace(found, asked={}, withdrawn={**found.withdrawn, **moved})
+    return found
 
 
 def _readable(store: EntryStore, task_file: TaskFile) -> tuple[list[SeedRun], list[str]]:

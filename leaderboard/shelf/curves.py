@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -23,9 +23,10 @@ from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance
+from qrlsuite.results.claims import living
 from qrlsuite.results.records import MEASURED, EntryRecord, Provenance, RunRecord
-from qrlsuite.results.seeds import parse_seeds, read_seeds
-from qrlsuite.results.store import SeedRun, parameters_of
+from qrlsuite.results.seeds import format_seeds, parse_seeds, read_seeds
+from qrlsuite.results.store import EntryStore, SeedRun, parameters_of
 from qrlsuite.results.text import counted, hours_text
 
 BESIDE = "-published"
@@ -62,6 +63,10 @@ class EntryResults(Shown):
         One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
     chosen_seeds:
         Why no board ranks it, if its seeds may have been chosen for publication; empty otherwise.
+    asked:
+        The epochs to which seeds were asked for, by seed; empty where nobody recorded it.
+    withdrawn:
+        Why seeds that were asked for no longer are, by seed.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     """
@@ -75,6 +80,8 @@ class EntryResults(Shown):
     mark: str = ""
     refused: tuple[str, ...] = ()
     chosen_seeds: str = ""
+    asked: Mapping[int, int] = field(default_factory=dict)
+    withdrawn: Mapping[int, str] = field(default_factory=dict)
     color: int | None = None
 
     @classmethod
@@ -109,6 +116,8 @@ class EntryResults(Shown):
             most=most,
             refused=tuple(sorted({*self.refused, *other.refused})),
             chosen_seeds=max(self.chosen_seeds, other.chosen_seeds),
+            asked={**self.asked, **other.asked},
+            withdrawn={s: why for s, why in {**self.withdrawn, **other.withdrawn}.items() if s not in seeds},
         )
 
     def has_code_of(self, other: EntryResults) -> bool:
@@ -196,6 +205,35 @@ class EntryResults(Shown):
     def left_out(self) -> tuple[int, ...]:
         """Seeds whose runs have fewer than T epochs yet."""
         return tuple(seed for seed in self.records if seed not in self.seeds)
+
+    @cached_property
+    def missing(self) -> tuple[int, ...]:
+        """The seeds that were asked for and have fewer than T epochs.
+
+        Where T is less than the task's shortest horizon, they need as many epochs as they were asked for.
+        """
+        short = self.epochs * self.steps_per_epoch < min(self.task_file.ranking.horizons)
+        there = {seed: run.epochs for seed, run in self.records.items()}
+        return tuple(
+            seed
+            for seed, epochs in sorted(self.asked.items())
+            if there.get(seed, 0) < (max(self.epochs, epochs) if short else self.epochs)
+        )
+
+    @property
+    def missing_text(self) -> str:
+        """`4 of 24 seeds are missing: 6, 7, 9, 18`, or `2 of 24 seeds are still training`; empty where none is."""
+        held = (
+            {s for claim in living(EntryStore(self.folder)) for s in claim.seeds} if self.missing else set()
+        )
+        total = len({*self.asked, *self.seeds})
+        training = held.intersection(self.missing)
+        lost = [seed for seed in self.missing if seed not in held]
+        told = ", ".join(map(str, lost)) if len(lost) <= 10 else format_seeds(lost)
+        return "; ".join(
+            [f"{len(training)} of {counted(total, 'seed')} {_are(training)} still training"] * bool(training)
+            + [f"{len(lost)} of {counted(total, 'seed')} {_are(lost)} missing: {told}"] * bool(lost)
+        )
 
     @cached_property
     def curves(self) -> NDArray[np.float64]:
@@ -347,7 +385,9 @@ class EntryResults(Shown):
         missing = sorted(set(wanted) - set(self.seeds))
         if missing:
             raise OptionError(f"'{self.label}' has no complete run of seed {missing[0]}")
-        return replace(self, records={seed: self.records[seed] for seed in wanted}, most=self.epochs)
+        return replace(
+            self, records={seed: self.records[seed] for seed in wanted}, most=self.epochs, asked={}
+        )
 
     @property
     def metrics(self) -> dict[str, NDArray[np.float64]]:
@@ -408,6 +448,7 @@ class EntryResults(Shown):
             "parameters": self.parameters_text(" quantum"),
             "seeds": f"{n_runs}"
             + (f", {len(self.left_out)} unfinished left out" if self.left_out else "")
+            + (f"; provisional: {self.missing_text}" if self.missing else "")
             + (f", {len(self.diverged)} diverged" if self.diverged else ""),
             **({"left out": "; ".join(self.refused)} if self.refused else {}),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
@@ -560,6 +601,10 @@ def _registered(registered: registry.Registry, name: str) -> Task | None:
         return load_task(name)
     except QrlSuiteError:
         return None  # its environment is not installed
+
+
+def _are(seeds: Collection[int]) -> str:
+    return "is" if len(seeds) == 1 else "are"
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

@@ -18,7 +18,7 @@ from qrlsuite.files import read_bytes
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
-from qrlsuite.results import codes, probes
+from qrlsuite.results import codes, probes, requests
 from qrlsuite.results.records import Provenance
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import Arrays, EntryStore, SeedRun, parameters_of
@@ -61,11 +61,17 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
         _require_all_seeds(folder, entry)
     runs = [store.seed(seed).read() for seed in entry.seeds]
     unfinished = [run.seed for run in runs if not run.finished]
+    if entry.missing and entry.study is None:
+        raise QrlSuiteError(
+            f"'{entry.label}' is not complete: {entry.missing_text}; repeat the `qrlsuite run` that made it, or "
+            "withdraw them with `qrlsuite runs rm`"
+        )
     if unfinished:
         raise QrlSuiteError(
             f"'{entry.label}' is not complete: {len(unfinished)} of {len(runs)} seeds are still training; "
             "repeat the `qrlsuite run` that made it"
         )
+    withdrawn = [line.content for line in requests.lines(store) if line.withdrawn and entry.withdrawn]
     records = [run.record for run in runs if run.record is not None]
     code = records[0].code
     content = published.files(
@@ -83,7 +89,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
         [_made_with(record.provenance) for record in records],
         {"classical": 0, "quantum": 0, **parameters_of(records)},
         fingerprint(built, entry.seeds),
-        _found(runs),
+        {**_found(runs), **({"withdrawn": withdrawn} if withdrawn else {})},
         kept,
         entry.metrics,
     )

@@ -29,7 +29,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
-from qrlsuite.results import checkpoint, codes, provenance, run_files
+from qrlsuite.results import checkpoint, codes, provenance, requests, run_files
 from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.records import MEASURED, Provenance, RunRecord
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
@@ -144,6 +144,9 @@ def import_seeds(source: EntryStore, runs: Path, study: str | None = None) -> Im
                 notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
             if without := sorted(set(new) - set(agents)):
                 notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
+        requests.take_over(
+            store, requests.lines(source) if exported is None else exported.published.withdrawn
+        )
         now, kept = identity.of(entry), codes.of(store)
         if (plugins := identity.plugins(entry)) and (kept is None or now in kept):
             codes.prepare(store, now, plugins)

@@ -43,6 +43,7 @@ from qrlsuite.results.records import (
     PublishedRecord,
     RunRecord,
 )
+from qrlsuite.results.requests import Requests
 from qrlsuite.results.store import (
     Arrays,
     EntryStore,
@@ -152,7 +153,10 @@ class PublishedEntry:
     def entry_results(self) -> EntryResults:
         """Return the entry as a leaderboard ranks it."""
         runs = {seed: self.run(row) for row, seed in enumerate(self.seeds)}
-        return EntryResults.of(self.record, self.folder, runs, chosen_seeds=self.chosen_seeds)
+        withdrawn = Requests.of(self.published.withdrawn).withdrawn
+        return EntryResults.of(
+            self.record, self.folder, runs, chosen_seeds=self.chosen_seeds, withdrawn=withdrawn
+        )
 
     def run(self, row: int) -> SeedRun:
         """Return one seed in the form of a results folder; its `scores` are the means."""

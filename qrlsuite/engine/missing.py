@@ -21,7 +21,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.identity import CodeIdentity
-from qrlsuite.results import checkpoint, codes, probes, speed
+from qrlsuite.results import checkpoint, codes, probes, requests, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup, format_seeds, plan_groups
@@ -97,10 +97,12 @@ def settle_codes(
 
 
 def prepare(work: Missing) -> None:
-    """Create the entry's folder, if need be, and write down with which code its missing seeds are trained."""
+    """Create the entry's folder, if need be, and write down what was asked for and which code trains it."""
     EntryStore.create(work.runs, work.entry, work.store.mark)
     if work.groups:
-        codes.prepare(work.store, work.code or identity.of(work.entry), identity.plugins(work.entry))
+        code = work.code or identity.of(work.entry)
+        codes.prepare(work.store, code, identity.plugins(work.entry))
+        requests.ask(work.store, work.seeds, work.epochs, code.digest)
 
 
 def _require_loadable(entry: Entry, store: EntryStore) -> None:

@@ -142,11 +142,15 @@ def _namespace() -> str:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock for the moment it takes to look and claim."""
-    with (folder / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+def locked(store: EntryStore) -> Iterator[None]:
+    """Hold an entry's lock for the moment it takes to look and claim, or to append a line."""
+    try:
+        store.claims.mkdir(parents=True, exist_ok=True)
+        with (store.claims / ".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+    except OSError as error:
+        raise StoreError(f"cannot write {store.claims}: {cause(error)}") from None
 
 
 def living(store: EntryStore) -> list[Claim]:
@@ -227,23 +231,19 @@ def _refreshed(claim: Claim) -> int | None:
 def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
     """Claim seeds for this process; raises a `SeedsClaimedError` where a living worker holds one of them."""
     wanted = set(seeds)
-    try:
-        store.claims.mkdir(parents=True, exist_ok=True)
-        with _locked(store.claims):
-            now = _file_system_time(store.claims)
-            states = {claim: _state(claim, now) for claim in claims(store)}
-            suspects = [c for c, state in states.items() if state == "suspect" and wanted & set(c.seeds)]
-            states |= dict.fromkeys(_abandoned(suspects), "dead")
-            holders = [claim for claim, state in states.items() if state != "dead"]
-            for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:
-                path.unlink(missing_ok=True)
-                path.with_suffix(".stop").unlink(missing_ok=True)
-            for holder in holders:
-                if shared := wanted & set(holder.seeds):
-                    raise SeedsClaimedError(_refusal(holder, sorted(shared)))
-            return _write(store, seeds)
-    except OSError as error:
-        raise StoreError(f"cannot write {store.claims}: {cause(error)}") from None
+    with locked(store):
+        now = _file_system_time(store.claims)
+        states = {claim: _state(claim, now) for claim in claims(store)}
+        suspects = [c for c, state in states.items() if state == "suspect" and wanted & set(c.seeds)]
+        states |= dict.fromkeys(_abandoned(suspects), "dead")
+        holders = [claim for claim, state in states.items() if state != "dead"]
+        for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:
+            path.unlink(missing_ok=True)
+            path.with_suffix(".stop").unlink(missing_ok=True)
+        for holder in holders:
+            if shared := wanted & set(holder.seeds):
+                raise SeedsClaimedError(_refusal(holder, sorted(shared)))
+        return _write(store, seeds)
 
 
 def _write(store: EntryStore, seeds: Sequence[int]) -> Claim:
@@ -267,14 +267,13 @@ def _write(store: EntryStore, seeds: Sequence[int]) -> Claim:
 
 def move_away(store: EntryStore, target: Path) -> None:
     """Rename an entry's folder while nobody trains it; who comes for its seeds later finds no entry."""
-    try:
-        store.claims.mkdir(exist_ok=True)
-        with _locked(store.claims):
-            for holder in living(store):
-                raise SeedsClaimedError(_refusal(holder, holder.seeds or (0,)))
+    with locked(store):
+        for holder in living(store):
+            raise SeedsClaimedError(_refusal(holder, holder.seeds or (0,)))
+        try:
             store.path.rename(target)
-    except OSError as error:
-        raise StoreError(f"cannot move {store.path}: {error.strerror or error}") from None
+        except OSError as error:
+            raise StoreError(f"cannot move {store.path}: {error.strerror or error}") from None
 
 
 def _refusal(holder: Claim, shared: Sequence[int]) -> str:

@@ -4,6 +4,7 @@
     run.json       RunRecord: one seed's run
     epochs.jsonl   EpochLine: one epoch of a seed; epochs.parquet has the same in columns
     timings.jsonl  TimingLine: how long that epoch took
+    requests.jsonl RequestLine: seeds that were asked for
     looks.jsonl    LookLine: an event of a study with looks
     evaluations/*.jsonl  RoundLine: the episodes of an evaluation that were played at once
 
@@ -247,6 +248,18 @@ class AgentsRecord(Record):
     provenance: list[Provenance] = []
 
 
+class RequestLine(Record):
+    """Seeds that were asked for, to so many epochs by a code; or, with a reason, that no longer are (`withdrawn`)."""
+
+    what: ClassVar[str] = "a request for seeds"
+
+    seeds: Annotated[list[Count], Field(min_length=1), AfterValidator(_sorted_once)]
+    epochs: Count = 0
+    code: str = ""
+    withdrawn: Annotated[Line, Field(min_length=1, max_length=300)] | None = None
+    time: str = ""
+
+
 def _counted(parameters: dict[str, int]) -> dict[str, int]:
     if missing := {"classical", "quantum"} - parameters.keys():
         raise ValueError(f"{' and '.join(sorted(missing))} missing")
@@ -263,7 +276,7 @@ class PublishedRecord(Record):
     """The facts of a published entry: numbers of `seeds` and `epochs`, `parameters` as `parameters_of` returns them.
 
     Each seed names one of the different provenances. `diverged` has by seed the first epoch after which its agent's
-    numbers were not finite. `measured` are metrics of the environment.
+    numbers were not finite. `measured` are metrics of the environment. `withdrawn` names seeds that were asked for.
     """
 
     seeds: Positive
@@ -276,6 +289,7 @@ class PublishedRecord(Record):
     probe: Annotated[ProbeRecord, AfterValidator(_independent)] | None = None
     agents: AgentsRecord | None = None
     measured: Annotated[list[Name], Field(max_length=100), AfterValidator(_sorted_once)] = []
+    withdrawn: list[RequestLine] = []
 
 
 PLUGINS = "plugins"

@@ -9,6 +9,7 @@
                         start/            agents with which seeds begin, if the entry begins with trained agents
                         groups/<id>/checkpoint.safetensors, progress.json
                         claims/<id>.json        who is working on which seeds
+                        requests.jsonl          the seeds that were asked for
                 <entry>@1a2b3c4d/               the same entry of other code (`qrlsuite.results.codes`)
 
 Files are replaced atomically (temporary file, fsync, rename) and carry a format version; lines are appended,

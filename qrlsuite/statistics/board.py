@@ -35,7 +35,7 @@ class Board:
         Shape (M, M, E, D): cells without a significant difference in which both intervals end at the horizon: too few
         steps to tell.
     decided:
-        Shape (M, M): whether both have at least 20 runs.
+        Shape (M, M): whether both have at least 20 runs, and all that were asked for.
     not_reached:
         Shape (M,): whether S_hat is the horizon in every cell.
     evidence:
@@ -97,7 +97,8 @@ def outperformance(
     runs = np.array([entry.n_runs for entry in entries], dtype=np.int64)
     ends = np.array([_end(entry, horizon) for entry in entries], dtype=np.int64)
     shared_runs, shared_ends = np.minimum.outer(runs, runs), np.minimum.outer(ends, ends)
-    decided: BoolArray = shared_runs >= MIN_RUNS
+    complete = np.array([entry.complete for entry in entries], dtype=np.bool_)
+    decided: BoolArray = (shared_runs >= MIN_RUNS) & np.logical_and.outer(complete, complete)
     np.fill_diagonal(decided, False)
     todo = np.triu(decided)
     _check_horizons(entries, horizon, todo, shared_ends)

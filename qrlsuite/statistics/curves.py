@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,8 @@ class LearningCurves:
         Environment steps between two validations.
     name:
         Name of the entry in sentences and rankings.
+    complete:
+        Whether all runs that were asked for are among them: a board ranks no others.
 
     Raises
     ------
@@ -94,6 +96,7 @@ class LearningCurves:
     values: Curve
     steps_per_epoch: int
     name: str = "entry"
+    complete: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", checked(self.values, name=f"'{self.name}'"))
@@ -128,9 +131,7 @@ class LearningCurves:
             raise OptionError(f"'{self.name}' ends at {self.horizon} steps, before the horizon of {horizon}")
         if horizon == self.horizon:
             return self
-        return LearningCurves(
-            self.values[:, : horizon // self.steps_per_epoch], self.steps_per_epoch, self.name
-        )
+        return replace(self, values=self.values[:, : horizon // self.steps_per_epoch])
 
     def require_unit_interval(self) -> None:
         """Raise OptionError unless every score lies in [0, 1], as tolerances epsilon presuppose."""

@@ -85,7 +85,7 @@ class TimesBoard:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Indices of the ranked entries by M, least first, equal ones by name; then entries below 20 runs."""
+        """Indices of the ranked entries by M, least first, equal ones by name; then the others."""
         return self._by([mean.mean for mean in self.means])
 
     @property
@@ -106,7 +106,7 @@ class TimesBoard:
 
     def _by(self, values: Sequence[float]) -> tuple[int, ...]:
         def key(index: int) -> tuple[bool, float, str]:
-            return self.n_runs[index] < MIN_RUNS, values[index], self.names[index]
+            return not self.ranks[index, 0], values[index], self.names[index]
 
         return tuple(sorted(range(len(self.names)), key=key))
 
@@ -120,9 +120,9 @@ def times_board(
 ) -> TimesBoard:
     """Compare all pairs of M entries by their mean time below threshold.
 
-    Entries with fewer than 20 runs stand apart: no pair with them is tested or counted. Numbers of runs may
-    differ. A decided pair has the direction of its largest |t|, unless thresholds of both signs are significant
-    at alpha / number of pairs: that is a trade-off.
+    Entries with fewer than 20 runs stand apart, and so do incomplete ones: no pair with them is tested or counted.
+    Numbers of runs may differ. A decided pair has the direction of its largest |t|, unless thresholds of both signs are
+    significant at alpha / number of pairs: that is a trade-off.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def times_board(
     cut = [entry.cut(end) for entry in entries]
     times = [times_below(entry.values, grid, entry.steps_per_epoch) for entry in cut]
     size = len(entries)
-    ranked = [index for index in range(size) if entries[index].n_runs >= MIN_RUNS]
+    ranked = [place for place, entry in enumerate(entries) if entry.n_runs >= MIN_RUNS and entry.complete]
     pairs = [(i, j) for place, i in enumerate(ranked) for j in ranked[place + 1 :]]
     test = MaxT([(times[i], times[j]) for i, j in pairs], seed=seed)
     refine(test, alpha)
@@ -192,7 +192,7 @@ def times_board(
         signs=signs,
         difference=difference,
         difference_interval=interval,
-        ranks=rank_ranges(better, counts >= MIN_RUNS),
+        ranks=rank_ranges(better, [place in ranked for place in range(size)]),
         few=(counts[:, None] != counts) & (np.minimum.outer(counts, counts) < FEW_RUNS),
     )
 

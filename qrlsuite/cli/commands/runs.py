@@ -15,8 +15,9 @@ from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.status import EntryStatus, choose, delete_each, survey
 from qrlsuite.engine.terminal import command, printable, table_console
 from qrlsuite.errors import OptionError
+from qrlsuite.notation import parse_named
 from qrlsuite.results import lookup
-from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.seeds import format_seeds, parse_seeds
 from qrlsuite.results.survey import STATUSES, EntrySurvey, garbage, remove
 from qrlsuite.results.text import counted, duration, size_text
 
@@ -125,29 +126,49 @@ def delete_entries(
         ),
     ],
     task: TaskOption = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            "--seeds",
+            metavar="'SEEDS reason=...'",
+            help="Only these, there or not: they are no longer asked for, and every verdict says why.",
+        ),
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Delete entries with all their seeds. It asks first, and deletes no entry that is being trained.
 
-    Example: qrlsuite runs rm "mlp width=64" --task beam6g
+    Examples: qrlsuite runs rm "mlp width=64" --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
+    --seeds "6,18 reason='the disk failed'"
     """
+    withdrawn = () if seeds is None else _withdrawn(seeds)
     chosen = choose(runs, names, task)
     for entry in chosen:
         description = (
             f"{entry.task}/{entry.name} ({entry.label}, {counted(sum(entry.seeds.values()), 'seed')})"
         )
-        typer.echo(f"{size_text(entry.size):>7}  {printable(description)}", err=json_output)
+        begin = f"seeds {format_seeds(withdrawn[0])} of" if withdrawn else f"{size_text(entry.size):>7} "
+        typer.echo(f"{begin} {printable(description)}", err=json_output)
     if not yes and not typer.confirm("Delete this for good?", err=json_output):
         typer.echo("nothing was deleted", err=json_output)
         raise typer.Exit(1)
-    freed = delete_each(runs, chosen)
+    freed = delete_each(runs, chosen, *withdrawn)
     if json_output:
         rows = [{"task": entry.task, "entry": entry.name, "size": entry.size} for entry in chosen]
         typer.echo(json.dumps({"deleted": rows, "freed": freed}))
     else:
         typer.echo(f"deleted, {size_text(freed)} freed")
+
+
+def _withdrawn(text: str) -> tuple[list[int], str]:
+    """Read seeds that are no longer asked for, and the reason."""
+    seeds, more = parse_named(text, "--seeds ")
+    if set(more) != {"reason"} or not str(more["reason"]).strip() or not str(more["reason"]).isprintable():
+        example = "--seeds \"6,18 reason='the disk failed'\""
+        raise OptionError(f"--seeds {text}: say why, in one line, for example {example}")
+    return parse_seeds(seeds), str(more["reason"]).strip()[:300]
 
 
 def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
