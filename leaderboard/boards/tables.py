@@ -252,8 +252,8 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
 def missing(entries: Sequence[EntryResults]) -> list[str]:
     """Name the seeds that were asked for and are not there, with what to do, and the requests that were withdrawn."""
     notes = {
-        "provisional, unranked until these seeds are trained (`qrlsuite run`) or withdrawn (`qrlsuite runs rm ENTRY "
-        "--seeds`)": {entry.label: entry.missing_text for entry in entries if entry.missing},
+        "provisional, without rank until these seeds are trained (`qrlsuite run`) or withdrawn (`qrlsuite runs rm "
+        "ENTRY --seeds`)": {entry.label: entry.missing_text for entry in entries if entry.missing},
         "seeds that were asked for, and withdrawn": {
             entry.label: "; ".join(
                 f"{format_seeds([seed for seed, why in entry.withdrawn.items() if why == reason])}: {reason}"

@@ -14,6 +14,7 @@ from qrlsuite.studies.state import (
     State,
     difference_text,
     horizon_note,
+    lost_note,
     needs_text,
     reason_note,
     versus,
@@ -38,11 +39,12 @@ def view(state: State) -> dict[str, Any]:
         names = {"question": clean(each["question"] or "", 300), "pair": clean(versus(pair))}
         row = {"verdict": clean(state.verdict(pair)), "seeds": pair.n_runs, "needs": needs}
         pairs.append({**names, **row, "difference": difference, "interval": interval})
+    notes = reason_note(study), lost_note(state), horizon_note(state)
     return {
         "name": clean(study.name),
         "question": clean(study.file.summary, 300),
         "facts": [(term, clean(value, 600)) for term, value in _facts(state, facts)],
-        "note": ". ".join(filter(None, (clean(reason_note(study), 600), horizon_note(state)))),
+        "note": ". ".join(clean(note, 600) for note in notes if note),
         "pairs": pairs,
         "looks": [_look(state, index) for index in range(len(study.design.looks))],
         "picture": _picture(state),

@@ -22,10 +22,9 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
-from qrlsuite.results import codes, probes, provenance
-from qrlsuite.results.claims import living
+from qrlsuite.results import codes, probes, provenance, requests
 from qrlsuite.results.records import MEASURED, EntryRecord, Provenance, RunRecord
-from qrlsuite.results.seeds import format_seeds, parse_seeds, read_seeds
+from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, parameters_of
 from qrlsuite.results.text import counted, hours_text
 
@@ -222,18 +221,8 @@ class EntryResults(Shown):
 
     @property
     def missing_text(self) -> str:
-        """`4 of 24 seeds are missing: 6, 7, 9, 18`, or `2 of 24 seeds are still training`; empty where none is."""
-        held = (
-            {s for claim in living(EntryStore(self.folder)) for s in claim.seeds} if self.missing else set()
-        )
-        total = len({*self.asked, *self.seeds})
-        training = held.intersection(self.missing)
-        lost = [seed for seed in self.missing if seed not in held]
-        told = ", ".join(map(str, lost)) if len(lost) <= 10 else format_seeds(lost)
-        return "; ".join(
-            [f"{len(training)} of {counted(total, 'seed')} {_are(training)} still training"] * bool(training)
-            + [f"{len(lost)} of {counted(total, 'seed')} {_are(lost)} missing: {told}"] * bool(lost)
-        )
+        """`4 of 24 seeds are missing: 6, 7, 9, 18`, or that some are still training."""
+        return requests.missing_text(EntryStore(self.folder), self.missing, len({*self.asked, *self.seeds}))
 
     @cached_property
     def curves(self) -> NDArray[np.float64]:
@@ -601,10 +590,6 @@ def _registered(registered: registry.Registry, name: str) -> Task | None:
         return load_task(name)
     except QrlSuiteError:
         return None  # its environment is not installed
-
-
-def _are(seeds: Collection[int]) -> str:
-    return "is" if len(seeds) == 1 else "are"
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

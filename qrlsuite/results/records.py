@@ -517,7 +517,10 @@ class DecidedPair(Record):
 
 
 class LookLine(Record):
-    """An event of the study whose hash is `plan`: it was begun or ended, or a look was taken at so many seeds."""
+    """An event of the study whose hash is `plan`: it was begun or ended, or a look was taken at so many seeds.
+
+    `seeds` is where the block of a study that was begun starts and stops; older lines leave it to the study's file.
+    """
 
     what: ClassVar[str] = "a line of a study's log"
 
@@ -525,6 +528,7 @@ class LookLine(Record):
     ended: str | None = None
     time: str | None = None
     plan: str | None = None
+    seeds: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
     look: Positive | None = None
     pairs: list[DecidedPair] = []
 

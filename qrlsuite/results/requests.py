@@ -13,9 +13,11 @@ from pathlib import Path
 
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import genuine
-from qrlsuite.results.claims import locked
+from qrlsuite.results.claims import living, locked
 from qrlsuite.results.records import RequestLine
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, drop_torn_line, json_line, read_records
+from qrlsuite.results.text import counted
 
 FILE = "requests.jsonl"
 
@@ -51,6 +53,19 @@ def lines(store: EntryStore) -> list[RequestLine]:
 def read(store: EntryStore) -> Requests:
     """Return the requests for an entry's seeds."""
     return Requests.of(lines(store))
+
+
+def missing_text(store: EntryStore, missing: Sequence[int], total: int) -> str:
+    """Write that seeds of so many are not there: `4 of 24 seeds are missing: 6, 7, 9, 18`, or are still training."""
+    held = {seed for claim in living(store) for seed in claim.seeds}
+    lost = [seed for seed in missing if seed not in held]
+    told = ", ".join(map(str, lost)) if len(lost) <= 10 else format_seeds(lost)
+    parts = {"still training": len(missing) - len(lost), f"missing: {told}": len(lost)}
+    return "; ".join(
+        f"{count} of {counted(total, 'seed')} {'is' if count == 1 else 'are'} {what}"
+        for what, count in parts.items()
+        if count
+    )
 
 
 def ask(store: EntryStore, seeds: Iterable[int], epochs: int, code: str) -> None:

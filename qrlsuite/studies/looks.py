@@ -32,6 +32,7 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
+from qrlsuite.results import requests
 from qrlsuite.results.records import DecidedPair, LookLine
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, json_line, read_records, write_atomically
@@ -164,6 +165,11 @@ class Study:
                     f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a study "
                     f"with looks needs seeds that nobody has seen; with first_seed = {self._next_block()} it has others"
                 )
+            for other, path in self.seen_before():
+                raise OptionError(
+                    f"{self.source}: study {other} has seen these seeds ({path}), and what they showed may have chosen "
+                    f"this one; with first_seed = {self._next_block()} it has others"
+                )
             return False
         before, after = _content(load_kept(self.folder / FILE)), _content(self.file)
         if digest(before) != self.hash:
@@ -193,6 +199,28 @@ class Study:
                     trained += [(name, seeds, path)] if seeds else []
         return trained
 
+    def seen_before(self) -> list[tuple[str, Path]]:
+        """Return other studies that began with seeds of the block and an entry of this one: hash, and log.
+
+        A log that does not say with which seeds a study began may mean these.
+        """
+        found, own = list[tuple[str, Path]](), self.looks.block
+        for path in sorted((self.runs / FOLDER).glob(f"*/{LOG}")):
+            file, lines = path.with_name(FILE), read_records(path, LookLine)
+            blocks = {line.plan: range(*line.seeds) for line in lines if line.seeds}
+            kept = load_kept(file) if file.is_file() else None
+            if kept is not None and kept.looks is not None:
+                blocks.setdefault(digest(_content(kept)), kept.looks.block)
+            theirs = [] if kept is None else kept.entries
+            shared = {table.hash for table in self.file.entries} & {table.hash for table in theirs}
+            for hash_ in dict.fromkeys(line.plan for line in lines if line.plan not in (None, self.hash)):
+                block = blocks.get(hash_, own)
+                if (shared or path.parent == self.folder) and max(block[0], own[0]) <= min(
+                    block[-1], own[-1]
+                ):
+                    found.append((str(hash_), path))
+        return found
+
     def _next_block(self) -> int:
         return self.looks.first_seed + max(1000, len(self.looks.block))
 
@@ -209,7 +237,8 @@ class Study:
         if not begun:
             write_atomically(self.folder / FILE, dumps(self.file).encode())
             if self._begun_at(log) is None:
-                append(self.folder / LOG, json_line({"begun": _now(), "plan": self.hash}))
+                block = [self.looks.block.start, self.looks.block.stop]
+                append(self.folder / LOG, json_line({"begun": _now(), "plan": self.hash, "seeds": block}))
 
     def _require_code_of_new_entries(self) -> None:
         """Refuse an entry without seeds if its code is not the code in the study's hash."""
@@ -253,7 +282,18 @@ class Study:
                     hours[name] += run.seconds / 3600
                 else:
                     hours[name] += folder.seconds() / 3600
-        return self.state(trained, hours, begun)
+        state = self.state(trained, hours, begun)
+        return replace(state, lost=self._lost(trained, self.looks.first_seed + max(state.taken, default=0)))
+
+    def _lost(self, trained: Mapping[str, Curves], end: int) -> dict[str, str]:
+        """Name the seeds before `end`, at which a look was taken, that were asked for and are not there."""
+        lost = dict[str, str]()
+        for name, entry in self.entries.items():
+            store = EntryStore.find(self.folder, entry)
+            asked = [seed for seed in requests.read(store).asked if seed < end]
+            if missing := [seed for seed in asked if seed not in trained[name]]:
+                lost[name] = requests.missing_text(store, missing, len(asked))
+        return lost
 
     def require_own(self, name: str, seed: int, study: str | None) -> None:
         """Refuse a seed of the block that another study, or none, has trained."""
@@ -266,7 +306,8 @@ class Study:
 
     def state(self, trained: Mapping[str, Curves], hours: Mapping[str, float], begun: bool) -> State:
         """Decide by the curves of finished seeds, and compare with the log of looks."""
-        log, seeds, curves = self._log(), dict[str, range](), dict[str, LearningCurves]()
+        log = [line for line in self._log() if line.plan in (None, self.hash)]
+        seeds, curves = dict[str, range](), dict[str, LearningCurves]()
         for name, done in trained.items():
             gap = next((seed for seed in self.looks.block if seed not in done), self.looks.block.stop)
             seeds[name] = range(self.looks.block.start, gap)
@@ -380,7 +421,7 @@ def new(
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(files.problems(error, StudyFile))) from None
     study = Study(file.of("the study"), runs)
-    while first_seed is None and study.trained_before():
+    while first_seed is None and (study.trained_before() or study.seen_before()):
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = Study(study.file.model_copy(update={"looks": moved}).of("the study"), runs)
     names, shared = list(study.entries), list[str]()

@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -67,6 +67,8 @@ class State(Shown):
         Every pair with its verdict, p at each look, difference and interval.
     submitted:
         One line for each entry whose seeds were handed to a queue.
+    lost:
+        By entry, a sentence about seeds that were asked for and are not there.
     """
 
     study: Study
@@ -79,6 +81,7 @@ class State(Shown):
     hours: Mapping[str, float]
     decision: Decision
     submitted: tuple[str, ...] = ()
+    lost: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def missing(self) -> dict[str, int]:
@@ -181,6 +184,7 @@ class State(Shown):
             "core_hours_saved": self.cost(saved),
             "core_hours_at_most": self.cost(dict.fromkeys(study.entries, study.design.looks[-1])),
             "submitted": list(self.submitted),
+            **({"lost": dict(self.lost)} if self.lost else {}),
         }
 
     def levels(self) -> list[dict[str, Any]]:
@@ -252,8 +256,7 @@ class State(Shown):
             yield Text(f"hash {study.hash}, first seed begun {self.begun_at}")
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
-        if note := reason_note(study):
-            yield Text(note)
+        yield from map(Text, filter(None, (reason_note(study), lost_note(self))))
         yield from map(Text, self._cost(facts))
 
     def late(self, pair: PairDecision) -> bool:
@@ -358,6 +361,14 @@ def horizon_note(outcome: State) -> str:
         "steps. That they are equal, or not told apart, says little there: neither had the time to learn. A study with "
         "more epochs may tell"
     )
+
+
+def lost_note(outcome: State) -> str:
+    """Say which seeds were asked for and are not there, and that the log is gone; empty where all is there."""
+    notes = [f"provisional: {told} ({name})" for name, told in outcome.lost.items()]
+    if outcome.begun and outcome.begun_at is None:
+        notes.append("its log is gone: nobody can see when it began, or who has seen its seeds before")
+    return "; ".join(notes)
 
 
 def versus(pair: PairDecision) -> str:

@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shlex
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -421,6 +422,44 @@ def test_seeds_of_others_are_refused(refused: Refused) -> None:
         (own.seed(10004).path / "run.json").write_text(json.dumps(stranger))
         assert "seed 10004 of 'mlp width=" in (message := refused("show", "widths.toml"))
         assert "was not trained by study" in message
+
+
+def test_a_study_that_begins_again_needs_other_seeds(refused: Refused) -> None:
+    """Its entries' folders are deleted, and it is changed: the log beside them has seen its seeds."""
+    run(write("mlp width=16", "mlp width=4"))
+    folder, first = Path("runs/decisions/widths"), answer("show", "widths.toml")
+    shutil.rmtree(folder / "tiny")
+    edit("widths.toml", "margin = 0.1", "margin = 0.3")
+    seen = f"study {first['hash']} has seen these seeds ({folder / 'looks.jsonl'})"
+    assert seen in (message := refused("study", "run", "widths.toml", "--engine", "scripted"))
+    assert "with first_seed = 11000 it has others" in message
+    write("mlp width=16", "mlp width=8", study="again.toml")
+    edit("again.toml", "first_seed = 11000", "first_seed = 10090")
+    assert seen in refused("study", "run", "again.toml", "--engine", "scripted"), "under another name, too"
+    edit("widths.toml", "first_seed = 10000", "first_seed = 11000")
+    assert answer("show", "widths.toml")["looks_taken"] == {}, "the looks of another study are not its own"
+    assert run()["looks_taken"].keys() == {"20"}
+    shutil.rmtree(folder / "tiny")
+    edit("widths.toml", "first_seed = 11000", "first_seed = 10099")
+    assert seen in refused("study", "run", "widths.toml", "--engine", "scripted")
+    log = folder / "looks.jsonl"
+    log.write_text(re.sub(r',"seeds":\[\d+,\d+\]', "", log.read_text()))
+    assert seen in refused("study", "run", "widths.toml", "--engine", "scripted"), "logs of earlier versions"
+
+
+def test_seeds_that_a_study_lost_are_named() -> None:
+    run(write("mlp width=16", "mlp width=4"))
+    assert "lost" not in answer("show", "widths.toml")
+    folder = Path("runs/decisions/widths")
+    store = next(s for s in map(EntryStore, (folder / "tiny").iterdir()) if "width=16" in s.record().label)
+    shutil.rmtree(store.seed(10003).path)
+    said = "1 of 20 seeds is missing: 10003"
+    assert answer("show", "widths.toml")["lost"] == {"mlp width=16": said}
+    assert f"provisional: {said} (mlp width=16)" in say("show", "widths.toml").stdout
+    read = studies.read_outcome("widths.toml", Path("runs"))
+    assert looks_report.view(read)["note"].startswith(f"provisional: {said}")
+    (folder / "looks.jsonl").unlink()
+    assert "its log is gone" in say("show", "widths.toml").stdout
 
 
 def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:
