@@ -431,6 +431,8 @@ def load_source(source: Source) -> Loaded:
             _load(registered, before.source)
         raise
     registered.announce(made.sentence)
+    for note in shortforms.notes(sys.modules[source.module]):
+        registered.announce(note)
     return made
 
 

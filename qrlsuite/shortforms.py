@@ -2,6 +2,7 @@
 
     form                     signature                                          registered as
     a function               (qubits, layers, ...) -> Circuit                   ansatz
+    a QNode, or a function beside `weight_shapes`   (inputs, weights, ...)      ansatz
     a torch.nn.Module        __init__(self, inputs, outputs, ...)               model
     a gymnasium.Env          __init__(self, ...)                                environment
     an algorithm's class     __init__(self, envs, build_model, streams, device, ...)   algorithm
@@ -24,12 +25,12 @@ import sys
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import pydantic
 
 from qrlsuite import specs
-from qrlsuite.errors import PluginError
+from qrlsuite.errors import OptionError, PluginError
 
 EPISODE_STEPS = 1000
 """At which episodes of an environment end."""
@@ -49,6 +50,10 @@ PRIVATE = "_qrlsuite_"
 """How the names of the targets of references begin."""
 
 
+SHAPES = "weight_shapes"
+"""The name of the table of shapes beside a quantum function, as for PennyLane's TorchLayer."""
+
+
 def kebab(name: str) -> str:
     """Return the name under which a function or class is registered: `RingNet` becomes `ring-net`."""
     words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", lambda m: f"{m[1] or m[3]}-{m[2] or ''}", name)
@@ -57,8 +62,8 @@ def kebab(name: str) -> str:
 
 def kind_of(thing: Any) -> type[specs.Spec] | None:
     """Return the kind that a function or class is a short form of, None where it is of none."""
-    if inspect.isfunction(thing):
-        return specs.AnsatzSpec if _builds_circuits(thing) else None
+    if inspect.isfunction(thing) or is_qnode(thing):
+        return specs.AnsatzSpec if is_quantum_function(thing) or _builds_circuits(thing) else None
     if not isinstance(thing, type):
         return None
     gymnasium, torch = sys.modules.get("gymnasium"), sys.modules.get("torch")
@@ -69,6 +74,50 @@ def kind_of(thing: Any) -> type[specs.Spec] | None:
     if all(callable(getattr(thing, name, None)) for name in _ALGORITHM):
         return specs.AlgorithmSpec
     return None
+
+
+def is_qnode(thing: Any) -> bool:
+    """Return whether this is a QNode of PennyLane, whose import it does not need."""
+    pennylane = sys.modules.get("pennylane")
+    return pennylane is not None and isinstance(thing, pennylane.QNode)
+
+
+def is_quantum_function(thing: Any) -> bool:
+    """Return whether this is a QNode, or a function beside `weight_shapes` whose first parameter is `inputs`."""
+    if is_qnode(thing):
+        return True
+    named = inspect.isfunction(thing) and list(inspect.signature(thing).parameters)[:1] == ["inputs"]
+    return named and "pennylane" in sys.modules and SHAPES in thing.__globals__
+
+
+def source_of(function: Any) -> Any:
+    """Return the Python function of a QNode, or the function itself."""
+    return function.func if is_qnode(function) else function
+
+
+def shapes_of(function: Any) -> Mapping[str, Any]:
+    """Return the table `weight_shapes` beside a quantum function.
+
+    Raises
+    ------
+    PluginError
+        If a parameter without default is not in it.
+    """
+    source = source_of(function)
+    shapes = source.__globals__.get(SHAPES, {})
+    _, *others = inspect.signature(source).parameters.values()
+    for each in others:
+        if each.default is each.empty and each.name not in shapes:
+            raise PluginError(
+                f"'{source.__name__}': the shape of '{each.name}' is not known; write at the top level of its file "
+                f'{SHAPES} = {{"{each.name}": lambda qubits, layers: (layers, qubits, 3)}}, or the shape in numbers'
+            )
+    return {each.name: shapes[each.name] for each in others if each.name in shapes}
+
+
+def has_one_size(function: Any) -> bool:
+    """Return whether the shapes of all weights are numbers, and so qubits and layers are given by the function."""
+    return not any(callable(shape) for shape in shapes_of(function).values())
 
 
 def lacking(things: Iterable[Any]) -> str:
@@ -119,6 +168,23 @@ def recognized(module: ModuleType) -> list[Any]:
     ]
 
 
+def notes(module: ModuleType) -> list[str]:
+    """Say of every network in a module that calls a QNode how it is trained faster."""
+    found = []
+    for cls in public(module):
+        codes = (getattr(each, "__code__", None) for each in vars(cls).values()) if kind_of(cls) else ()
+        names = {name for code in codes if code is not None for name in code.co_names}
+        qnodes = sorted(name for name in names if is_qnode(getattr(module, name, None)))
+        if (
+            qnodes and not {"layer", "TorchLayer"} & names
+        ):  # who builds a TorchLayer is refused, in the same words
+            found.append(
+                f"note: {cls.__name__} calls the QNode {qnodes[0]}, one sample or agent after the other: "
+                f"self.circuit = qrlsuite.layer({qnodes[0]}) is the same circuit for all agents at once"
+            )
+    return found
+
+
 def _is_part(cls: type[Any]) -> bool:
     try:
         _signature(cls, ("inputs", "outputs"), optional=ASKED)
@@ -129,7 +195,7 @@ def _is_part(cls: type[Any]) -> bool:
 
 def line_of(thing: Any) -> int | None:
     """Return the line where a function or class begins, None where it is not known."""
-    code = getattr(thing, "__code__", None)
+    code = getattr(source_of(thing), "__code__", None)
     if code is not None:
         return int(code.co_firstlineno)
     try:
@@ -208,14 +274,43 @@ class _Holder:
 
 
 def _ansatz(function: Callable[..., Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
-    options, call = _signature(function, ("qubits", "layers"))
+    qubits = None
+    if is_quantum_function(function):
+        try:
+            options, call = _signature(
+                source_of(function), ("inputs",), tuple(shapes_of(function)), more=_ENTANGLED
+            )
 
-    def build(qubits: int, layers: int, chosen: Any) -> Any:
-        return call(qubits, layers, options=chosen)
+            def build(qubits: int | None, layers: int, chosen: Any) -> Any:
+                own = functools.partial(call, options=chosen)
+                trace = specs.resolve("qrlsuite.circuit.tracing:trace")
+                return trace(function, qubits, layers, own, chosen.entangled == "mean-field")
+
+            if has_one_size(function):
+                qubits = build(None, 1, options()).qubits
+        except OptionError as error:
+            raise PluginError(str(error)) from error
+    else:
+        options, call = _signature(function, ("qubits", "layers"))
+
+        def build(qubits: int | None, layers: int, chosen: Any) -> Any:
+            return call(qubits, layers, options=chosen)
 
     return specs.AnsatzSpec(
-        name, summary, options=holder.put("options", options), build=holder.put("build", build)
+        name, summary, holder.put("options", options), holder.put("build", build), qubits=qubits
     )
+
+
+_ENTANGLED = (
+    (
+        "entangled",
+        Annotated[
+            Literal[True, "mean-field"],
+            pydantic.Field(description="mean-field: without correlations of qubits"),
+        ],
+        True,
+    ),
+)
 
 
 def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
@@ -298,6 +393,7 @@ def _signature(
     first: tuple[str, ...],
     named: tuple[str, ...] = (),
     optional: tuple[str, ...] = (),
+    more: tuple[tuple[str, Any, Any], ...] = (),
 ) -> tuple[type[Any], Callable[..., Any]]:
     """Return the options class of a signature, and a function that calls with an object of it as `options`.
 
@@ -307,6 +403,8 @@ def _signature(
         Arguments by position; the parameters may have other names.
     named, optional:
         Arguments by name: always, and if there is such a parameter.
+    more:
+        Further options, where there is no such parameter: name, annotation, default.
     """
     parameters = [
         each
@@ -328,6 +426,7 @@ def _signature(
     if [each.name for each in rest] == ["options"] and dataclasses.is_dataclass(hints.get("options")):
         return hints["options"], _calling(thing, takes, lambda chosen: {"options": chosen})
     fields = [_field(thing, each, hints) for each in rest]
+    fields += [each for each in more if each[0] not in takes]
     body: dict[str, Any] = {name: default for name, _, default in fields}
     body |= {
         "__annotations__": {name: annotation for name, annotation, _ in fields},

@@ -272,12 +272,24 @@ class StudySpec(Spec):
 
 @dataclass(frozen=True, slots=True)
 class AnsatzSpec(NumericSpec):
-    """A circuit family: `build(qubits, layers, options) -> qrlsuite.circuit.Circuit`."""
+    """A circuit family: `build(qubits, layers, options) -> qrlsuite.circuit.Circuit`.
+
+    Attributes
+    ----------
+    qubits:
+        Of a circuit of one size: its number of qubits, which models take, with 1 layer, where neither is set.
+    """
 
     kind, kinds = "ansatz", "ansatzes"
 
     options: str
     build: str
+    qubits: int | None = None
+
+    @property
+    def size(self) -> dict[str, int]:
+        """The size of a circuit of one size, as options of a model; empty for any other."""
+        return {} if self.qubits is None else {"qubits": self.qubits, "layers": 1}
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,8 +72,8 @@ def _picture(spec: specs.Spec) -> str:
         from qrlsuite.circuit import ansatz
         from qrlsuite.circuit.drawing import draw_text
 
-        drawn = ansatz(spec.name, *SIZE)
-        return f"{SIZE[0]} qubits, {SIZE[1]} layers:\n{draw_text(drawn)}"
+        qubits, layers = tuple(spec.size.values()) or SIZE
+        return f"{qubits} qubits, {layers} layers:\n{draw_text(ansatz(spec.name, qubits, layers))}"
     if isinstance(spec, specs.ModelSpec):
         import torch
         from gymnasium.spaces import Box

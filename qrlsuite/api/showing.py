@@ -130,7 +130,8 @@ def _ansatz(
     picture_format = pictures.format_of(out, "--out")
     if "name" in settings:
         raise OptionError(f"ansatz '{name}': name: no option of that name")
-    drawn = circuit.ansatz(name, **{"qubits": 4, "layers": 2, **settings})
+    size = registry.get(specs.AnsatzSpec, name).size
+    drawn = circuit.ansatz(name, **{"qubits": 4, "layers": 2, **size, **settings})
     if code:
         return {"circuit text": canonical(drawn), **identity.of_registered(specs.AnsatzSpec, name, drawn)}
     if format is not None:

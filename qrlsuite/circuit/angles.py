@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from qrlsuite.circuit.description import Circuit
+from qrlsuite.circuit.description import Circuit, Encoding
 from qrlsuite.errors import CircuitError
 
 
@@ -45,11 +45,11 @@ class AngleTable:
         for operation in circuit:
             rows: list[int | float] = []
             for angle in operation.angles:
-                if angle.input is None and angle.scale is None and angle.weight is None:
+                if not angle.varies:
                     rows.append(angle.constant)
                     continue
-                if angle.product is not None:
-                    raise CircuitError("products of inputs are written as inputs by `create_backend`")
+                if angle.product is not None or isinstance(angle.input, Encoding):
+                    raise CircuitError("functions of inputs are written as inputs by `create_backend`")
                 rows.append(len(constant))
                 constant.append(angle.constant)
                 self.controlled.append(operation.control is not None)

@@ -21,7 +21,9 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 import numpy as np
 
 from qrlsuite.circuit.description import (
+    FUNCTIONS,
     Circuit,
+    Encoding,
     Product,
     apart,
     in_bases,
@@ -142,7 +144,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     if not isinstance(circuit, Circuit):
         raise PluginError(
             f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit of qrlsuite.circuit; "
-            "docs/circuits.md#circuits-out-and-in shows how to turn a QNode's gates into one"
+            "a QNode stands in the file by itself, see docs/circuits.md#circuits-out-and-in"
         )
     return circuit
 
@@ -219,13 +221,13 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
 
 
 class _Whole:
-    """A backend made of the backends of a circuit's parts; products of inputs are further inputs of the parts.
+    """A backend made of the backends of a circuit's parts, to which functions and products of inputs are more inputs.
 
     Parts are measurement bases and, where the backend takes no more at once, qubits that nothing connects.
     """
 
     def __init__(
-        self, parts: Sequence[CircuitBackend], places: Sequence[int], products: Sequence[Product]
+        self, parts: Sequence[CircuitBackend], places: Sequence[int], products: Sequence[Encoding | Product]
     ) -> None:
         self.parts = parts
         self.places = places
@@ -274,10 +276,13 @@ def _part_seed(seed: int, part: int) -> int:
     return int(np.random.SeedSequence((seed, part)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
-    """Return inputs (..., in) with products of them behind, see `without_products`."""
+def extended(inputs: torch.Tensor, further: Sequence[Encoding | Product]) -> torch.Tensor:
+    """Return inputs (..., in) with functions and products of them behind, see `without_products`."""
     import torch
 
+    if columns := [_encoded(each, inputs) for each in further if isinstance(each, Encoding)]:
+        inputs = torch.cat([inputs, torch.stack(columns, dim=-1)], dim=-1)
+    products = [each for each in further if not isinstance(each, Encoding)]
     if not products:
         return inputs
     first, second, times = zip(*products)
@@ -285,10 +290,27 @@ def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
     if None in first or None in second:  # 1 stands behind the inputs
         factors = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1)
     left, right = ([-1 if i is None else i for i in each] for each in (first, second))
-    further = factors[..., left] * factors[..., right]
+    products_of_inputs = factors[..., left] * factors[..., right]
     if any(number != 1.0 for number in times):
-        further = further * inputs.new_tensor(times)
-    return torch.cat([inputs, further], dim=-1)
+        products_of_inputs = products_of_inputs * inputs.new_tensor(times)
+    return torch.cat([inputs, products_of_inputs], dim=-1)
+
+
+def _encoded(term: Encoding | int, inputs: torch.Tensor) -> torch.Tensor:
+    """Return an input, or a function of inputs, (...)."""
+    import torch
+
+    if not isinstance(term, Encoding):
+        return inputs[..., term]
+    values = []
+    for angle in term.of:
+        terms = [_encoded(each, inputs) for each in (angle.input, angle.factor) if each is not None]
+        value = functools.reduce(torch.mul, terms, torch.full_like(inputs[..., 0], angle.times))
+        values.append(value + angle.constant if terms else torch.full_like(value, angle.constant))
+    if term.function in FUNCTIONS:
+        found: torch.Tensor = getattr(torch, term.function)(values[0])
+        return found
+    return functools.reduce(torch.add if term.function == "sum" else torch.mul, values)
 
 
 def _make(spec: CircuitBackendSpec, circuit: Circuit, chosen: Any) -> CircuitBackend:

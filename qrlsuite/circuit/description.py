@@ -5,9 +5,10 @@ A `Circuit` is a list of operations on qubits 0..n-1. Every rotation angle is af
     angle = constant + scale * input + weight
 
 where `scale` and `weight` are elements of named trainable parameters (either may be absent; an absent scale with an
-input present counts as 1), and `input` may be a product of two inputs, a multiple, or a number. Reading order is
-application order. Qubit 0 is the most significant bit of a basis state's index, as in PennyLane. The measured
-observables are Pauli Z on chosen qubits (default: every), or products of Pauli X, Y and Z.
+input present counts as 1), and `input` may be any function of the inputs that numpy's functions, sums and products
+write, such as `np.arctan(circuit.input(0))`, or a number. Reading order is application order. Qubit 0 is the most
+significant bit of a basis state's index, as in PennyLane. The measured observables are Pauli Z on chosen qubits
+(default: every), or products of Pauli X, Y and Z.
 
 A qubit may be measured before the end, its outcome may control later gates, and a qubit may be reset. This is written
 with its measurement deferred to the end (Nielsen & Chuang 2010, section 4.4), so that every backend runs it.
@@ -32,9 +33,11 @@ Only numpy is imported here.
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -121,8 +124,37 @@ Word = tuple[tuple[str, int | Outcome], ...]
 
 _FACTOR = re.compile(r"\s*([XYZ])(\d+)\s*")
 
-Product = tuple[int | None, int | None, float]
+FUNCTIONS = ("arctan", "arcsin", "arccos", "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")
+"""The functions of inputs that an angle may have, by their names in numpy and torch."""
+
+Product = tuple["int | Encoding | None", "int | Encoding | None", float]
 """A product of inputs: the first (None for 1), the second (None for 1), and a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """A function of inputs that stands in the place of an input: one of `FUNCTIONS`, `sum` or `product`.
+
+    Attributes
+    ----------
+    of:
+        The arguments: angles without parameters.
+    """
+
+    function: str
+    of: tuple[Angle, ...]
+
+    def text(self, write: Callable[[Angle], str]) -> str:
+        """Write the function as an expression, with a function that writes an angle."""
+        if self.function in FUNCTIONS:
+            return f"{self.function}({write(self.of[0])})"
+        sign = " + " if self.function == "sum" else " * "
+        return f"({sign.join(f'({write(each)})' for each in self.of)})"
+
+    @property
+    def inputs(self) -> set[int]:
+        """The input features that it depends on."""
+        return set().union(*(each.inputs for each in self.of))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,23 +163,25 @@ class Angle:
 
     Attributes
     ----------
-    factor:
-        A second input, by which the first is multiplied.
+    input, factor:
+        An input, or a function of inputs; and a second one, by which the first is multiplied.
     times:
         A number by which the input term is multiplied. A scale without an input is multiplied by this number alone.
     """
 
     constant: float = 0.0
-    input: int | None = None
+    input: int | Encoding | None = None
     scale: Element | None = None
     weight: Element | None = None
-    factor: int | None = None
+    factor: int | Encoding | None = None
     times: float = 1.0
 
     def __mul__(self, other: Angle | float) -> Angle:
         """Multiply inputs, a trainable scale and numbers (in any order); nothing else may be multiplied."""
         if isinstance(other, _NUMBER):
             return self._multiple(float(other))
+        if isinstance(other, np.ndarray):  # numpy multiplies every element
+            return NotImplemented
         for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
             times = a.times * b.times
             if a.is_bare_input and (parameter := b._parameter):
@@ -156,12 +190,25 @@ class Angle:
                 return Angle(input=a.input, factor=b.input, times=times)
             if a._is_scaled_input and b.is_bare_input and a.factor is b.factor is None:
                 return Angle(input=a.input, scale=a.scale, factor=b.input, times=times)
+        if isinstance(other, Angle) and not (self.elements or other.elements):
+            return Angle(input=Encoding("product", (self, other)))
+        for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
+            if b.elements:
+                continue
+            if parameter := a._parameter:
+                return Angle(input=Encoding("sum", (b,)), scale=parameter, times=a.times)
+            if a._is_scaled_input:
+                encoding = Encoding("product", (replace(a, scale=None, times=1.0), b))
+                return Angle(input=encoding, scale=a.scale, times=a.times)
         what = (
-            "an angle is affine"
+            "products of parameters"
             if isinstance(other, Angle)
             else f"an angle cannot be multiplied by {other!r}"
         )
-        raise CircuitError(f"{what}: only one or two inputs, one parameter and numbers can be multiplied")
+        raise CircuitError(
+            f"{what}: an angle is constant + scale * (function of inputs) + weight, with one parameter each for scale "
+            "and weight; give the gate a parameter of its own"
+        )
 
     __rmul__ = __mul__
 
@@ -177,6 +224,33 @@ class Angle:
             "parameter another range (low, high)"
         )
 
+    def __truediv__(self, number: float) -> Angle:
+        return self * (1.0 / number)
+
+    def __pow__(self, number: int) -> Angle:
+        if isinstance(number, _NUMBER) and number in range(1, 9):
+            return functools.reduce(operator.mul, [self] * int(number))
+        raise CircuitError(f"an angle to the power of {number!r}: write a whole number from 1 to 8")
+
+    def __getattr__(self, name: str) -> Callable[[], Angle]:
+        """Return one of `FUNCTIONS`, as numpy looks for them: `np.arctan(angle)` calls `angle.arctan()`."""
+        if name in FUNCTIONS:
+            return functools.partial(self._function, name)
+        raise AttributeError(name)
+
+    def _function(self, name: str) -> Angle:
+        if self.elements:
+            raise CircuitError(
+                f"{name} of a parameter: functions take inputs alone; multiply the result by the parameter"
+            )
+        return Angle(input=Encoding(name, (self,)))
+
+    def __float__(self) -> float:
+        raise CircuitError(
+            "the angle depends on an input or a parameter, and is no number yet: write it with numpy, such as "
+            f"np.arctan(x), not math.atan(x); of functions there are {', '.join(FUNCTIONS)}"
+        )
+
     def __neg__(self) -> Angle:
         return self._multiple(-1.0)
 
@@ -186,9 +260,19 @@ class Angle:
             return replace(self, constant=self.constant + float(other))
         if not isinstance(other, Angle):
             return NotImplemented
-        if (self._has_term and other._has_term) or (self.weight and other.weight):
-            raise CircuitError("an angle holds at most one input term and one weight: scale * input + weight")
-        term = self if self._has_term else other
+        if (self._has_term and other._has_term and (self.scale or other.scale)) or (
+            self.weight and other.weight
+        ):
+            raise CircuitError(
+                "an angle holds at most one scale and one weight, without numbers before it: scale * input + weight; "
+                "RX(a + b) is RX(a), RX(b)"
+            )
+        if self._has_term and other._has_term:
+            parts = (replace(each, constant=0.0, weight=None) for each in (self, other))
+            term = Angle(input=Encoding("sum", tuple(parts)), constant=self.constant)
+        else:
+            term = self if self._has_term else other
+            other = other if term is self else self
         return replace(term, constant=self.constant + other.constant, weight=self.weight or other.weight)
 
     __radd__ = __add__
@@ -222,9 +306,41 @@ class Angle:
         return (self.scale or self.weight) if alone else None
 
     @property
+    def elements(self) -> tuple[Element, ...]:
+        """The trainable scalars in it."""
+        return tuple(each for each in (self.scale, self.weight) if each is not None)
+
+    @property
+    def varies(self) -> bool:
+        """Whether it depends on an input or a parameter."""
+        return self._has_term or self.weight is not None
+
+    @property
+    def inputs(self) -> set[int]:
+        """The input features that it depends on."""
+        terms = (each for each in (self.input, self.factor) if each is not None)
+        return set().union(*(each.inputs if isinstance(each, Encoding) else {each} for each in terms))
+
+    @property
+    def functions(self) -> set[str]:
+        """The functions of inputs in it."""
+        terms = [each for each in (self.input, self.factor) if isinstance(each, Encoding)]
+        inner = (part.functions for each in terms for part in each.of)
+        return {each.function for each in terms}.union(*inner)
+
+    def on(self, place: Mapping[int | Encoding | None, int]) -> Angle:
+        """Return the angle with inputs in the places of its functions of inputs."""
+        if not (isinstance(self.input, Encoding) or isinstance(self.factor, Encoding)):
+            return self
+        return replace(
+            self, input=place.get(self.input, self.input), factor=place.get(self.factor, self.factor)
+        )
+
+    @property
     def product(self) -> Product | None:
-        """The product that the input term stands for; None where that is an input, or there is none."""
-        plain = self.input is not None and self.factor is None and self.times == 1.0
+        """The product or function that the input term stands for; None where that is an input, or there is none."""
+        written = self.input is None or isinstance(self.input, Encoding)
+        plain = not written and self.factor is None and self.times == 1.0
         return None if plain or not self._has_term else (self.input, self.factor, self.times)
 
 
@@ -577,8 +693,8 @@ class Circuit:
     def _check(self, angle: Angle) -> None:
         if not (math.isfinite(angle.constant) and math.isfinite(angle.times)):
             raise CircuitError("an angle's numbers must be finite")
-        for feature in (angle.input, angle.factor):
-            if feature is not None and not 0 <= feature < self.inputs:
+        for feature in angle.inputs:
+            if not 0 <= feature < self.inputs:
                 raise CircuitError(f"input {feature}: this circuit has inputs 0..{self.inputs - 1}")
         if angle.factor is not None and angle.input is None:
             raise CircuitError("a second input needs a first one to multiply")
@@ -609,6 +725,11 @@ class Circuit:
 
     def __len__(self) -> int:
         return len(self._operations)
+
+    @property
+    def functions(self) -> set[str]:
+        """The functions of inputs that its angles have: `FUNCTIONS`, `sum`, `product`."""
+        return {name for operation in self for angle in operation.angles for name in angle.functions}
 
     @property
     def parameter_count(self) -> int:
@@ -707,30 +828,36 @@ def apart(circuit: Circuit) -> list[tuple[Circuit, tuple[int, ...]]]:
     return divided
 
 
-def without_products(circuit: Circuit) -> tuple[Circuit, tuple[Product, ...]]:
-    """Write products and multiples of inputs, and numbers before a parameter, as inputs behind the others.
+def without_products(circuit: Circuit) -> tuple[Circuit, tuple[Encoding | Product, ...]]:
+    """Write functions of inputs, products, multiples, and numbers before a parameter, as inputs behind the others.
 
     Returns
     -------
     tuple
-        A circuit without products (the same one where it has none), and the factors of each further input.
+        A circuit of plain inputs (the same one where it has no other), and each further input: the functions first,
+        then the products, whose factors may be any inputs before them.
     """
-    written = [angle.product for operation in circuit for angle in operation.angles]
-    if not any(written):
+    angles = [angle for operation in circuit for angle in operation.angles]
+    encodings = dict.fromkeys(
+        each for angle in angles for each in (angle.input, angle.factor) if isinstance(each, Encoding)
+    )
+    place: dict[int | Encoding | None, int] = {each: circuit.inputs + k for k, each in enumerate(encodings)}
+    products = tuple(dict.fromkeys(p for angle in angles if (p := angle.on(place).product) is not None))
+    further: tuple[Encoding | Product, ...] = (*encodings, *products)
+    if not further:
         return circuit, ()
-    products = tuple(dict.fromkeys(each for each in written if each is not None))
-    plain = Circuit(circuit.qubits, circuit.inputs + len(products), circuit.mean_field)
+    plain = Circuit(circuit.qubits, circuit.inputs + len(further), circuit.mean_field)
     plain.parameters = dict(circuit.parameters)
     for operation in circuit:
-        angles = [
+        written = [
             angle
             if (product := angle.product) is None
-            else replace(angle, input=circuit.inputs + products.index(product), factor=None, times=1.0)
-            for angle in operation.angles
+            else replace(angle, input=circuit.inputs + further.index(product), factor=None, times=1.0)
+            for angle in (each.on(place) for each in operation.angles)
         ]
-        plain.append(operation.gate, operation.wires, *angles, control=operation.control)
+        plain.append(operation.gate, operation.wires, *written, control=operation.control)
     plain.measure(circuit.observables)
-    return plain, products
+    return plain, further
 
 
 def canonical(circuit: Circuit) -> str:
@@ -753,7 +880,11 @@ def canonical(circuit: Circuit) -> str:
 
 def _written(angle: Angle) -> str:
     """Write an angle: its constant, and after a plus sign each, its inputs with their scale, and its weight."""
-    inputs = [f"x{index}" for index in (angle.input, angle.factor) if index is not None]
+    inputs = [
+        each.text(_written) if isinstance(each, Encoding) else f"x{each}"
+        for each in (angle.input, angle.factor)
+        if each is not None
+    ]
     scale = [f"{angle.scale.parameter}[{angle.scale.index}]"] if angle.scale else []
     weight = [f"{angle.weight.parameter}[{angle.weight.index}]"] if angle.weight else []
     times = [] if angle.times == 1.0 or not angle._has_term else [repr(float(angle.times))]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from qrlsuite.circuit.description import Angle, Circuit, Operation
+from qrlsuite.circuit.description import Angle, Circuit, Encoding, Operation
 from qrlsuite.circuit.resources import Resources, gate_name, resources
 
 if TYPE_CHECKING:
@@ -27,7 +27,11 @@ def angle_text(angle: Angle) -> str:
     if angle.input is not None or angle.scale is not None:
         times = [] if angle.times == 1.0 else [f"{angle.times:.4g}"]
         scale = [] if angle.scale is None else [f"{angle.scale.parameter}[{angle.scale.index}]"]
-        inputs = [f"x{each}" for each in (angle.input, angle.factor) if each is not None]
+        inputs = [
+            each.text(angle_text) if isinstance(each, Encoding) else f"x{each}"
+            for each in (angle.input, angle.factor)
+            if each is not None
+        ]
         terms.append("*".join([*times, *scale, *inputs]))
     if angle.weight is not None:
         terms.append(f"{angle.weight.parameter}[{angle.weight.index}]")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
+from qrlsuite.circuit.description import FUNCTIONS, Angle, Circuit, Element, Encoding, Operation
 from qrlsuite.errors import OptionError, nearest
 
 _QISKIT_FIXED = {"CNOT": "cx", "CZ": "cz", "SWAP": "swap"}
@@ -35,16 +35,28 @@ def export(circuit: Circuit, format: str) -> str:
         raise OptionError(f"--format {format}: one of {', '.join(FORMATS)}{nearest(format, FORMATS)}")
     if circuit.mean_field:
         raise OptionError(f"--format {format}: the mean-field approximation of a circuit is none")
+    used = circuit.functions
+    if lacking := sorted(used & {"sinh", "cosh", "tanh", "sqrt"}) if format != "pennylane" else []:
+        raise OptionError(f"--format {format}: it has no function {lacking[0]} of inputs")
     return FORMATS[format](circuit)
 
 
-def _formula(angle: Angle, feature: Callable[[int], str], element: Callable[[Element], str]) -> str:
-    """Write an angle as a Python or QASM expression."""
+def _formula(
+    angle: Angle, feature: Callable[[int], str], element: Callable[[Element], str], functions: str = ""
+) -> str:
+    """Write an angle as a Python or QASM expression; functions of inputs have the prefix `functions`."""
+
+    def factor(term: int | Encoding) -> str:
+        if not isinstance(term, Encoding):
+            return feature(term)
+        prefix = functions if term.function in FUNCTIONS else ""
+        return prefix + term.text(lambda part: _formula(part, feature, element, functions))
+
     terms = []
     if angle.input is not None or angle.scale is not None:
         factors = [] if angle.times == 1.0 else [repr(angle.times)]
         factors += [] if angle.scale is None else [element(angle.scale)]
-        factors += [feature(i) for i in (angle.input, angle.factor) if i is not None]
+        factors += [factor(each) for each in (angle.input, angle.factor) if each is not None]
         terms.append(" * ".join(factors))
     if angle.weight is not None:
         terms.append(element(angle.weight))
@@ -63,6 +75,7 @@ def _rotations(operation: Operation, angles: list[str]) -> Iterable[tuple[str, s
 def _qiskit(circuit: Circuit) -> str:
     """Return a program that makes `circuit` and `observables`; parameters are flat, in C order."""
     lines = [
+        *(["import numpy as np"] if circuit.functions else []),
         "from qiskit import QuantumCircuit",
         "from qiskit.circuit import ParameterVector",
         "from qiskit.quantum_info import SparsePauliOp",
@@ -74,7 +87,8 @@ def _qiskit(circuit: Circuit) -> str:
     lines += ["", f"circuit = QuantumCircuit({circuit.qubits})"]
     for operation in circuit:
         angles = [
-            _formula(a, lambda i: f"x[{i}]", lambda e: f"{e.parameter}[{e.index}]") for a in operation.angles
+            _formula(a, lambda i: f"x[{i}]", lambda e: f"{e.parameter}[{e.index}]", "np.")
+            for a in operation.angles
         ]
         wires = ", ".join(map(str, operation.qubits))
         controlled = "" if operation.control is None else "c"
@@ -113,7 +127,7 @@ def _pennylane(circuit: Circuit) -> str:
         f'    """Expectation values; {", ".join(shapes)}."""',
     ]
     for operation in circuit:
-        angles = [_formula(a, lambda i: f"x[..., {i}]", element) for a in operation.angles]
+        angles = [_formula(a, lambda i: f"x[..., {i}]", element, "qml.math.") for a in operation.angles]
         name = _PENNYLANE_FIXED.get(operation.gate, operation.gate)
         wires = list(operation.wires)
         arguments = ", ".join([*angles, f"wires={wires[0] if len(wires) == 1 else wires}"])

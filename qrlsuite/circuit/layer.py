@@ -10,13 +10,16 @@ torch.Size([32, 2])
 from __future__ import annotations
 
 import copy
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from qrlsuite import shortforms
+from qrlsuite.circuit import tracing
 from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend
 from qrlsuite.circuit.description import Circuit
 from qrlsuite.errors import OptionError
@@ -25,7 +28,7 @@ DTYPES = (torch.float32, torch.float64)
 
 
 def layer(
-    circuit: str | Circuit,
+    circuit: str | Circuit | Callable[..., Any],
     qubits: int | None = None,
     layers: int = 1,
     *,
@@ -40,9 +43,10 @@ def layer(
     Parameters
     ----------
     circuit:
-        Name of an ansatz (`qrlsuite list ansatzes`), or a circuit of your own.
+        Name of an ansatz (`qrlsuite list ansatzes`), a circuit of your own, or a QNode of PennyLane or its function
+        `(inputs, weights...)`, see `qrlsuite.circuit.tracing`.
     qubits, layers:
-        Size of the circuit, if a name is given.
+        Size of the circuit, if a name is given; of a QNode's, if its shapes depend on them.
     backend:
         Backend that computes it (`qrlsuite list circuit_backends`); `native` is the fast simulator.
     backend_options:
@@ -65,6 +69,9 @@ def layer(
         if qubits is None:
             raise OptionError(f"say how many qubits: layer('{circuit}', qubits=6)")
         circuit = ansatz(circuit, qubits, layers, **options)
+    elif not isinstance(circuit, Circuit):
+        call = functools.partial(shortforms.source_of(circuit), **options)
+        circuit = tracing.trace(circuit, qubits, layers, call)
     elif qubits is not None or layers != 1 or options:
         raise OptionError(
             "a circuit of your own has its size and options already: leave out qubits, layers and others"

@@ -65,7 +65,7 @@ def shift_evaluations(circuit: Circuit) -> int:
         4 if operation.control is not None else 2
         for operation in circuit
         for angle in operation.angles
-        if angle.input is not None or angle.scale is not None or angle.weight is not None
+        if angle.varies
     )
 
 

@@ -44,7 +44,7 @@ def generators(circuit: Circuit) -> Matrix:
         for place, own in ROTATIONS[operation.gate]:
             whole = _on(own if operation.control is None else np.kron(_ONE, own), operation.qubits, n)
             angle = operation.angles[place]
-            if angle.input is None and angle.scale is None and angle.weight is None:
+            if not angle.varies:
                 values, vectors = np.linalg.eigh(whole)
                 turn = (vectors * np.exp(-1j * angle.constant * values)) @ vectors.conj().T
                 before = turn @ before

@@ -111,9 +111,9 @@ def highest_frequency(circuit: Circuit, feature: int, parameters: Mapping[str, A
     total = np.zeros(1)
     for operation in circuit:
         for angle in operation.angles:
-            if feature not in (angle.input, angle.factor):
+            if feature not in angle.inputs:
                 continue
-            if angle.factor is not None:
+            if angle.input != feature or angle.factor is not None:
                 return math.inf
             scale = np.ones(1)
             if angle.scale is not None:

@@ -213,7 +213,9 @@ def resolve(
     values = options.assign(written.settings, sides)
     _hand_to_ansatz(values, sides, source.model)
     model_options = options.build(
-        sides["model"], {**source.model, **values["model"]}, f"model '{model.name}'"
+        sides["model"],
+        {**_size(sides, {**source.model, **values["model"]}), **source.model, **values["model"]},
+        f"model '{model.name}'",
     )
     if hasattr(model_options, "check"):
         model_options.check()
@@ -229,6 +231,15 @@ def resolve(
         tuning=source.record(values),
         start=written.start,
     )
+
+
+def _size(sides: Mapping[str, type[Any]], values: Mapping[str, Any]) -> dict[str, int]:
+    """Return the size of a model's ansatz, if that is a circuit of one size."""
+    if "ansatz" not in sides:
+        return {}
+    chosen = {**options.plain(sides["model"]()), **values}["ansatz"]
+    registered = registry.load().of(specs.AnsatzSpec)
+    return registered[chosen].spec.size if chosen in registered else {}
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,10 @@ def check(subject: Subject) -> list[Finding]:
     build, options = specs.resolve(spec.build), subject.options()
     circuits: Circuits = {}
     rules = Checklist()
-    if not rules.run("builds", "1 to 4 qubits, 1 to 12 layers", lambda: _builds(build, options, circuits)):
+    several = {(qubits, layers) for qubits in QUBITS for layers in (*LAYERS, 3 * qubits)} | {(LARGEST, 1)}
+    sizes = {(spec.qubits, 1)} if spec.qubits else several
+    built = effects.size(spec.qubits, 1) if spec.qubits else "1 to 4 qubits, 1 to 12 layers"
+    if not rules.run("builds", built, lambda: _builds(build, options, circuits, sizes)):
         return rules.findings
     rules.run("pure", "built twice, it is the same circuit", lambda: _pure(build, options, circuits))
     rules.run("inputs used", "every input feature sets an angle", lambda: _inputs(circuits))
@@ -48,9 +51,8 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-def _builds(build: Any, options: Any, circuits: Circuits) -> None:
+def _builds(build: Any, options: Any, circuits: Circuits, sizes: set[tuple[int, int]]) -> None:
     refused = ""
-    sizes = {(qubits, layers) for qubits in QUBITS for layers in (*LAYERS, 3 * qubits)} | {(LARGEST, 1)}
     for qubits, layers in sorted(sizes):
         size = effects.size(qubits, layers)
         try:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.circuit import Angle, Circuit, Operation
+from qrlsuite.circuit.description import FUNCTIONS, Encoding
 from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
 
 _PAULIS = {"X": X, "Y": Y, "Z": Z}
@@ -60,11 +62,21 @@ def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, N
     value = angle.constant
     if angle.input is not None or angle.scale is not None:
         scale = 1.0 if angle.scale is None else parameters[angle.scale.parameter].flat[angle.scale.index]
-        first, second = (1.0 if each is None else inputs[each] for each in (angle.input, angle.factor))
+        first, second = (_feature(each, inputs) for each in (angle.input, angle.factor))
         value += float(scale * first * second * angle.times)
     if angle.weight is not None:
         value += float(parameters[angle.weight.parameter].flat[angle.weight.index])
     return value
+
+
+def _feature(term: int | Encoding | None, inputs: NDArray[np.float64]) -> float:
+    """Return an input, a function of inputs, or 1 for None."""
+    if not isinstance(term, Encoding):
+        return 1.0 if term is None else float(inputs[term])
+    values = [_angle(each, inputs, {}) for each in term.of]
+    if term.function in FUNCTIONS:
+        return float(getattr(np, term.function)(values[0]))
+    return sum(values) if term.function == "sum" else math.prod(values)
 
 
 def _rotation(pauli: Matrix, angle: float) -> Matrix:

@@ -70,7 +70,7 @@ def size(qubits: int, layers: int) -> str:
 
 def used_inputs(circuit: Circuit) -> set[int]:
     """Return the input features that set an angle."""
-    return {angle.input for op in circuit.operations for angle in op.angles if angle.input is not None}
+    return {feature for op in circuit.operations for angle in op.angles for feature in angle.inputs}
 
 
 def uses(circuit: Circuit) -> dict[Scalar, list[int]]:

@@ -107,6 +107,12 @@ def require_none(
         How many numbers a pass must return for each sample; None asks nothing of them.
     """
     probe = build(0)
+    for name, part in probe.named_modules():
+        if type(part).__name__ == "TorchLayer":
+            raise PluginError(
+                f"model '{model}': self.{name} is a TorchLayer of PennyLane, whose agents cannot be trained together: "
+                f"write self.{name} = qrlsuite.layer(QNODE), the same circuit on a faster simulator"
+            )
     before, other = held(probe), held(build(1))
     for path, (value, cure) in before.items():
         if path not in other or not _equal(value, other[path][0]):

@@ -1,11 +1,13 @@
 """Rotations of two qubits, products of inputs, and products of Pauli Z: the same on all backends."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 from qrlsuite import registry, specs
-from qrlsuite.circuit import Circuit, create_backend, expectations
+from qrlsuite.circuit import Angle, Circuit, create_backend, expectations
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import canonical, in_bases, without_products
 from qrlsuite.circuit.drawing import angle_text, draw_text
@@ -55,7 +57,20 @@ def words():
     return circuit
 
 
-@pytest.mark.parametrize("make", [rich, multiples, words])
+def functions():
+    """Return a circuit with functions, sums and products of inputs."""
+    circuit = Circuit(3, inputs=2)
+    w, (x, y) = circuit.parameter("w", (4,)), map(circuit.input, range(2))
+    circuit.append("RY", 0, np.arctan(x) + w[0])
+    circuit.append("RX", 1, w[1] * np.arctan(2 * x - 0.3) * y + 0.2)
+    circuit.append("RZZ", (0, 1), 2 * (np.pi - x) * (np.pi - y))
+    circuit.append("RY", 2, 0.5 * w[2] * (np.sin(x / 2) ** 2 + np.exp(y) - x + 1) + w[3])
+    circuit.append("RX", 2, x * y * x, control=0)
+    circuit.measure([0, (0, 1), 2])
+    return circuit
+
+
+@pytest.mark.parametrize("make", [rich, multiples, words, functions])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_values_and_gradients_on_every_backend(backend, make):
     circuit = make()
@@ -142,13 +157,24 @@ def test_products_are_drawn():
     angles = [angle_text(a) for op in multiples() for a in op.angles]
     assert angles[:4] == ["2*x0 + w[0]", "-0.5*w[1]", "-3*w[1]*x0 + 0.3", "-0.5*x0 + 1.571"]
     assert "\nRX 1 0.0+-0.5*w[1]\n" in canonical(multiples())
+    angles = [angle_text(a) for op in functions() for a in op.angles]
+    assert angles[:2] == ["arctan(x0) + w[0]", "w[1]*arctan(2*x0 + -0.3)*x1 + 0.2"]
+    assert "\nRY 0 0.0+arctan(0.0+x0)+w[0]\n" in canonical(functions())
 
 
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda c: c.input(0) * c.input(1) * c.input(0), "an angle is affine: only"),
-        (lambda c: c.input(0) * "2", "an angle cannot be multiplied by '2': only one or two inputs"),
+        (lambda c: (w := c.parameter("w", (2,)))[0] * w[1], "products of parameters: an angle is constant"),
+        (
+            lambda c: (w := c.parameter("w", (2,)))[0] + w[1],
+            r"at most one scale and one weight.* RX\(a\), RX\(b\)",
+        ),
+        (lambda c: np.tanh(c.parameter("w", (2,))[0]), "tanh of a parameter: functions take inputs alone"),
+        (lambda c: math.atan(c.input(0)), r"such as np.arctan\(x\), not math.atan"),
+        (lambda c: np.arctan(c.input(0)) ** 0.5, "to the power of 0.5"),
+        (lambda c: c.append("RX", 0, np.arctan(Angle(input=2))), "this circuit has inputs 0..1"),
+        (lambda c: c.input(0) * "2", "an angle cannot be multiplied by '2'"),
         (
             lambda c: 2 * (c.input(0) + c.parameter("w", (1,))[0]),
             "a sum of an input and a parameter cannot be",

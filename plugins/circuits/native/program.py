@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.circuit.description import Angle, Circuit, Operation, Parameter
+from qrlsuite.circuit.description import Angle, Circuit, Encoding, Operation, Parameter
 from qrlsuite.errors import CircuitError
 
 AXIS_X, AXIS_Y, AXIS_Z, PHASE = 0, 1, 2, 3
@@ -279,8 +279,8 @@ class Compiler:
 
     def angle(self, angle: Angle) -> int:
         """Add an angle to the table; returns its index."""
-        if angle.product is not None:
-            raise CircuitError("products of inputs are written as inputs by `create_backend`")
+        if angle.product is not None or isinstance(angle.input, Encoding):
+            raise CircuitError("functions of inputs are written as inputs by `create_backend`")
         scale, weight = (
             NONE if element is None else self.offset[element.parameter] + element.index
             for element in (angle.scale, angle.weight)

@@ -174,6 +174,12 @@ def _written(words: list[str], model: str | None, settings: list[str], quick: bo
     written = parse_entry(" ".join(words)).given(settings=tuple(map(options.parse_setting, settings)))
     if not quick or any(setting.name == "qubits" for setting in written.settings):
         return written
+    ansatzes = registry.load().of(specs.AnsatzSpec)
+    if any(
+        each.name == "ansatz" and each.value in ansatzes and ansatzes[str(each.value)].spec.size
+        for each in written.settings
+    ):
+        return written
     names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, written.model).options))
     fewer = (options.Setting("model", "qubits", QUICK_QUBITS),) if "qubits" in names else ()
     return written.given(settings=fewer)
