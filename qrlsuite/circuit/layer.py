@@ -81,6 +81,31 @@ def layer(
     )
 
 
+class _OfAgents(torch.autograd.Function):
+    """A layer within `torch.vmap`: the backend computes all agents in one pass, each as if it were alone."""
+
+    @staticmethod
+    def forward(layer: CircuitLayer, inputs: Tensor, *parameters: Tensor) -> Tensor:
+        raise RuntimeError("of the transforms of torch.func, the layer has only vmap, over agents")
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Keep nothing: `vmap` is differentiated by the backend's own function."""
+
+    @staticmethod
+    def vmap(
+        info: Any, axes: tuple[int | None, ...], layer: CircuitLayer, *tensors: Tensor
+    ) -> tuple[Tensor, int]:
+        backend = layer._prepared()
+        if getattr(backend, "draws", backend.shots is not None):
+            raise RuntimeError("vmap: samples are drawn for each agent in its turn")
+        inputs, *parameters = (
+            each.expand(info.batch_size, *each.shape) if axis is None else each.movedim(axis, 0)
+            for axis, each in zip(axes[1:], tensors)
+        )
+        return backend(inputs, dict(zip(layer.circuit, parameters)), None), 0
+
+
 class CircuitLayer(nn.Module):
     """A circuit's expectation values as a layer, made by `layer`.
 
@@ -141,9 +166,12 @@ class CircuitLayer(nn.Module):
         first = next(iter(self.circuit.values()), None)
         dtype = first.dtype if first is not None else inputs.dtype
         flat = inputs.reshape(1, -1, self.in_features).to(dtype)
-        parameters = {name: value[None] for name, value in self.circuit.items()}
-        values: Tensor = self._prepared()(flat, parameters, self._sampling_seed())
-        return values[0].reshape(shape).to(inputs.dtype)
+        if torch._C._are_functorch_transforms_active():
+            values: Tensor = _OfAgents.apply(self, flat[0], *self.circuit.values())  # type: ignore[no-untyped-call]
+        else:
+            parameters = {name: value[None] for name, value in self.circuit.items()}
+            values = self._prepared()(flat, parameters, self._sampling_seed())[0]
+        return values.reshape(shape).to(inputs.dtype)
 
     def extra_repr(self) -> str:
         """Describe the circuit in the layer's printed form."""

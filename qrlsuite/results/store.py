@@ -706,8 +706,8 @@ class EntryStore:
             )
         try:
             entry = record.entry(str(self.path / "entry.json"))
-            if isinstance(ansatz := getattr(entry.model_options, "ansatz", None), str):
-                registry.load().get(specs.AnsatzSpec, ansatz)
+            if hasattr(entry.model_options, "ansatz_options"):  # else a word of the model's own
+                registry.load().get(specs.AnsatzSpec, entry.model_options.ansatz)
             return entry
         except UnknownNameError as error:
             raise UnknownNameError(f"{error}{copies_of_plugins(self, record)}") from None

@@ -172,16 +172,19 @@ def interquartile_mean(values: ArrayLike) -> FloatArray:
     return mean
 
 
-def probability_of_improvement(first: Sequence[ArrayLike], second: Sequence[ArrayLike]) -> float:
+def probability_of_improvement(
+    first: Sequence[ArrayLike] | NDArray[np.floating], second: Sequence[ArrayLike] | NDArray[np.floating]
+) -> float:
     """Return the mean over tasks of P(a run of the first < a run of the second), ties counting one half.
 
     Parameters
     ----------
     first, second:
-        K arrays (runs,) each, one per task.
+        K arrays (runs,), one per task; or one array (runs, K), as for rliable.
     """
     shares = []
-    for ours, theirs in zip(first, second, strict=True):
+    by_task = (each.T if isinstance(each, np.ndarray) else each for each in (first, second))
+    for ours, theirs in zip(*by_task, strict=True):
         difference = np.asarray(theirs)[:, None] - np.asarray(ours)
         shares.append((difference > 0).mean() + (difference == 0).mean() / 2)
     return float(np.mean(shares))

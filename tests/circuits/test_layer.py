@@ -14,6 +14,7 @@ from torch import Tensor, nn
 import qrlsuite
 from qrlsuite.circuit import Circuit, ansatz, expectations
 from qrlsuite.errors import QrlSuiteError
+from qrlsuite.population import gradients, stack
 
 
 def made(**changes: Any) -> Any:
@@ -93,6 +94,39 @@ def test_float32_inputs_give_float32_and_the_type_is_the_default_one() -> None:
     assert made()(torch.zeros(2, 3)).dtype == torch.float32
     assert {p.dtype for p in qrlsuite.layer("cz", 3).parameters()} == {torch.float32}
     assert "qubits=3, in_features=3, out_features=3, backend='native'" in repr(made())
+
+
+def hybrid(seed: int, **options: Any) -> nn.Module:
+    torch.manual_seed(seed)
+    return nn.Sequential(nn.Linear(4, 3), qrlsuite.layer("iqp", 3, 2, **options), nn.Linear(3, 2))
+
+
+def test_agents_of_a_population_run_together_and_each_is_the_same_bits_alone() -> None:
+    x = torch.randn(5, 6, 4, generator=torch.Generator().manual_seed(0))
+    together = stack([hybrid(seed) for seed in range(5)])
+    values = together(x)
+    gradients(values.square().sum(), together)
+    assert together.problem is None
+    for seed in (0, 3):
+        alone = stack([hybrid(seed)])
+        own = alone(x[seed : seed + 1])
+        gradients(own.square().sum(), alone)
+        assert torch.equal(own[0], values[seed])
+        for mine, theirs in zip(alone.parameters(), together.parameters()):
+            assert torch.equal(mine.grad[0], theirs.grad[seed])  # type: ignore[index]
+        single = hybrid(seed)
+        torch.testing.assert_close(single(x[seed]), values[seed])
+        single(x[seed]).square().sum().backward()
+        for plain, theirs in zip(single.parameters(), together.parameters()):
+            torch.testing.assert_close(plain.grad, theirs.grad[seed])  # type: ignore[index]
+    with pytest.raises(RuntimeError, match="the layer has only vmap"):
+        torch.func.grad(lambda each: hybrid(0)(each).sum())(x[0])
+
+
+def test_samples_of_shots_are_drawn_one_agent_after_the_other() -> None:
+    together = stack([hybrid(seed, backend_options={"shots": 20}) for seed in range(2)])
+    assert together(torch.zeros(2, 3, 4)).shape == (2, 3, 2)
+    assert "samples are drawn for each agent in its turn" in str(together.problem)
 
 
 @pytest.mark.parametrize(

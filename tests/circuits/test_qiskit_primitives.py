@@ -46,6 +46,7 @@ def circuit() -> QuantumCircuit:
     [
         (["ZIII", SUM, "YYII"], VALUES),
         (SUM, VALUES),
+        (SUM, VALUES[0]),
         ([["ZIII"], [SUM], ["IIII"], ["IIXX"]], VALUES[0]),
         (["ZIII", "IXYZ", SUM], VALUES[0]),
     ],

@@ -455,6 +455,67 @@ def test_the_module_beside_a_file_is_meant_where_python_has_another(monkeypatch:
     assert first_network(resolve("beam6g", "scaled")).scale == 2
 
 
+def test_an_option_named_ansatz_is_a_word_of_the_models_own(tmp_path: Path) -> None:
+    own.load(
+        write(
+            "tiny.py",
+            """
+            import torch
+
+
+            class Tiny(torch.nn.Linear):
+                def __init__(self, inputs, outputs, ansatz: str = "line"):
+                    super().__init__(inputs, outputs)
+            """,
+        )
+    )
+    entry = resolve("beam6g", "tiny ansatz=square")
+    assert EntryStore.create(tmp_path / "runs", entry).entry().hash == entry.hash
+
+
+def test_a_network_that_calls_a_qnode_is_told_what_to_do() -> None:
+    own.load(
+        write(
+            "net.py",
+            """
+            import pennylane as qml
+            import torch
+
+            weight_shapes = {"weights": (2,)}
+
+
+            @qml.qnode(qml.device("default.qubit", wires=2))
+            def swirl(inputs, weights):
+                qml.RX(inputs[0] * weights[0], wires=0)
+                qml.RY(inputs[1] * weights[1], wires=1)
+                return qml.expval(qml.Z(0)), qml.expval(qml.Z(1))
+
+
+            class Calls(torch.nn.Module):
+                def __init__(self, inputs, outputs):
+                    super().__init__()
+                    self.weights = torch.nn.Parameter(torch.rand(2))
+                    self.last = torch.nn.Linear(2, outputs)
+
+                def forward(self, x):
+                    return self.last(torch.stack(swirl(x.T, self.weights), -1))
+
+
+            class Torch(torch.nn.Sequential):
+                def __init__(self, inputs, outputs):
+                    super().__init__(torch.nn.Linear(inputs, 2), qml.qnn.TorchLayer(swirl, weight_shapes))
+            """,
+        )
+    )
+    assert [note.partition(",")[0] for note in shortforms.notes(sys.modules["net"])] == [
+        "note: Calls calls the QNode swirl"
+    ]
+    with pytest.raises(
+        PluginError, match=r"self.1 is a TorchLayer of PennyLane.*: write self.1 = qrlsuite.layer\(QNODE\)"
+    ):
+        require_trainable([resolve("beam6g", "torch")])
+
+
 @pytest.mark.parametrize(
     ("path", "text", "counts"),
     [

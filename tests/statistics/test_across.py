@@ -42,6 +42,7 @@ def test_probability_of_improvement_by_hand() -> None:
     first, second = drawn(0).T, drawn(1).T
     expected = np.mean([mannwhitneyu(b, a).statistic / (len(a) * len(b)) for a, b in zip(first, second)])
     assert probability_of_improvement(list(first), list(second)) == pytest.approx(expected)
+    assert probability_of_improvement(first.T, second.T) == pytest.approx(expected)  # as rliable has them
 
 
 def test_aggregates_are_those_of_rliable() -> None:

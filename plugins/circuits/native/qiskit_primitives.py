@@ -124,7 +124,7 @@ class EstimatorV2(BaseEstimatorV2):  # type: ignore[misc]  # Qiskit has no types
         pub, plan = work
         means = _means(pub, plan)
         if pub.precision:
-            means = np.random.default_rng(self.seed).normal(means, pub.precision)
+            means = np.asarray(np.random.default_rng(self.seed).normal(means, pub.precision))
         data = DataBin(evs=means, stds=np.zeros_like(means), shape=means.shape)
         metadata = {"target_precision": pub.precision, "circuit_metadata": pub.circuit.metadata}
         return PubResult(data, metadata=metadata)
