@@ -86,7 +86,7 @@ PICTURES: dict[str, Picture] = {
         "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
         ("entries/beam6g/*",),
     ),
-    "diagnose-circuit.png": Plot("diagnose ansatz iqp --qubits 2:16:2", ()),
+    "diagnose-circuit.png": Plot("diagnose ansatz iqp qubits=2:16:2", ()),
     "diagnose-agents.png": Plot(
         "diagnose 'vqc-native qubits=6' --task beam6g --published", ("entries/beam6g/ddqn-vqc-native-*",)
     ),

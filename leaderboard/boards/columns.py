@@ -169,11 +169,7 @@ def ranks_text(ranks: Sequence[int]) -> str:
 def names(entries: Sequence[EntryResults]) -> list[str]:
     """Return the names of entries in a table: their labels, without the algorithm if all share it."""
     alike = len({entry.algorithm for entry in entries}) == 1
-    return [
-        (entry.label.removeprefix(f"{entry.algorithm} ") if alike else entry.label)
-        + " †" * entry.on_protocol_seeds
-        for entry in entries
-    ]
+    return [(entry.short if alike else entry.label) + " †" * entry.on_protocol_seeds for entry in entries]
 
 
 def _name(section: Section) -> Column[Row]:

@@ -293,8 +293,7 @@ def _short(first: EntryResults, second: EntryResults) -> tuple[str, str]:
     """Return both labels, without the algorithm if they share it."""
     if first.algorithm != second.algorithm:
         return first.label, second.label
-    prefix = f"{first.algorithm} "
-    return first.label.removeprefix(prefix), second.label.removeprefix(prefix)
+    return first.short, second.short
 
 
 def on_board(

@@ -36,7 +36,8 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     chosen: CurvesOptions = options.build(CurvesOptions, settings, "picture 'curves'")
     cells.one_task(entries, "curves")
     many = len(entries) > MANY
-    beside = 0.7 + 0.07 * max(len(style.label(entry)) for entry in entries)
+    texts = style.in_legend(entries)
+    beside = 0.7 + 0.07 * max(map(len, texts))
     size = (7.2 + beside, max(4.3, 0.6 + 0.19 * len(entries))) if many else (7.2, 4.3 + 0.19 * len(entries))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
@@ -51,9 +52,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
             axes.plot(steps, entry.curves.T, color=look.color, linewidth=0.5, alpha=0.25)
         if not many:
             axes.fill_between(steps, low, high, color=look.color, alpha=0.15 if single else 0.1, linewidth=0)
-        (line,) = axes.plot(
-            steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry)
-        )
+        (line,) = axes.plot(steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=texts[i])
         lines.append((float(middle.mean()), line))
         if len(steps) == 1:  # a line of one point is nothing to see
             line.set(marker="o", markersize=9)

@@ -58,9 +58,16 @@ def provisional(entry: EntryResults) -> bool:
     return len(entry.seeds) < entry.task_file.protocol.seeds
 
 
-def label(entry: EntryResults) -> str:
-    """Return an entry's text in a legend: its label and its seeds."""
-    return f"{plain(entry.legend)}  ({seeds_text(entry)})"
+def in_legend(entries: Sequence[EntryResults]) -> list[str]:
+    """Return the texts of entries in a legend: labels and seeds."""
+    texts = _apart([entry.legend for entry in entries])
+    return [f"{text}  ({seeds_text(entry)})" for text, entry in zip(texts, entries)]
+
+
+def _apart(texts: Sequence[str], longest: int = 60) -> list[str]:
+    """Return texts for matplotlib, cut unless that makes two of them alike."""
+    short = [plain(text, longest) for text in texts]
+    return short if len(set(short)) == len(set(texts)) else [plain(text, 1000) for text in texts]
 
 
 def plain(text: str, longest: int = 60) -> str:
@@ -108,15 +115,16 @@ def labels(entries: Sequence[EntryResults], longest: int = 60) -> list[str]:
     algorithms = {entry.algorithm for entry in entries}
 
     def short_name(entry: EntryResults) -> str:
-        start = f"{entry.algorithm} " if len(algorithms) == 1 else ""
+        start = f"{entry.algorithm} " if len(algorithms) == 1 and not entry.own_label else ""
         whole = entry.legend.removeprefix(start)
         return whole if len(whole) <= longest else entry.label.removeprefix(start)
 
     short = [short_name(entry) for entry in entries]
-    return [
-        plain(text if short.count(text) == 1 else f"{entry.name.rpartition('-')[2]} {text}", longest)
+    texts = [
+        text if short.count(text) == 1 else f"{entry.name.rpartition('-')[2]} {text}"
         for text, entry in zip(short, entries)
     ]
+    return _apart(texts, longest)
 
 
 def facts(entry: EntryResults) -> str:

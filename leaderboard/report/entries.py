@@ -118,7 +118,7 @@ def _commands(entry: EntryResults) -> list[tuple[str, str]]:
     ]
     published = ["--published"] * (entry.source != "runs")
     named, place = f"{entry.task}/{entry.name}", entry.folder.parts[-4:]
-    lines = [("Train", ["run", entry.label, "--task", *task, "--seeds", str(len(entry.seeds))])]
+    lines = [("Train", ["run", entry.trained_as, "--task", *task, "--seeds", str(len(entry.seeds))])]
     if published and place[0] == "leaderboard":
         lines.append(("Check", ["verify", "/".join(place), "--rerun", "2"]))
     lines.append(("Curves", ["plot", "curves", "--task", entry.task, "--entry", entry.name, *published]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -47,6 +47,8 @@ class Selection:
         The only entries to read, of studies or not, whatever their task; None for the entries that boards rank.
     all_codes:
         Whether to read each entry of every code, and not only of the newest code with enough seeds to rank.
+    labels:
+        The reader's names for entries, `ENTRY=TEXT` each.
     """
 
     runs: Path
@@ -54,13 +56,22 @@ class Selection:
     tasks: tuple[str, ...] = ()
     only: Collection[Key] | None = None
     all_codes: bool = False
+    labels: tuple[str, ...] = ()
 
     @classmethod
     def create(
-        cls, runs: str | PathLike[str], task: str | Sequence[str] | None = None, published: bool = False
+        cls,
+        runs: str | PathLike[str],
+        task: str | Sequence[str] | None = None,
+        published: bool = False,
+        labels: Mapping[str, str] | Sequence[str] | None = None,
     ) -> Selection:
         """Make a selection from the arguments of a command or of `qrlsuite.api`; tasks stay in the user's words."""
-        return cls(Path(runs), published, (task,) if isinstance(task, str) else tuple(task or ()))
+        words = (
+            [f"{entry}={text}" for entry, text in labels.items()] if isinstance(labels, Mapping) else labels
+        )
+        tasks = (task,) if isinstance(task, str) else tuple(task or ())
+        return cls(Path(runs), published, tasks, labels=tuple(words or ()))
 
     def of(self, *tasks: str) -> Selection:
         """Return the selection of other tasks."""
@@ -82,6 +93,31 @@ class Selection:
         stores = _stores(self, of_studies=True)
         found = lookup.stored(store for store in stores if not tasks or _task(store) in tasks)
         return [entry for entry in found if not tasks or entry.task in tasks]
+
+    @functools.cached_property
+    def _own_labels(self) -> dict[tuple[str, str, str], str]:
+        """The reader's names by the keys of entries, of which the longest that fits begins a word of `labels`."""
+        found: dict[tuple[str, str, str], str] = {}
+        for word in self.labels:
+            parts = word.split("=")
+            splits = [("=".join(parts[:k]), "=".join(parts[k:])) for k in range(len(parts) - 1, 0, -1)]
+            name, text = next(
+                (split for split in splits if lookup.fitting(self.stored, split[0])), (word, "")
+            )
+            fitting = lookup.fitting(self.stored, name)
+            if len({entry.name for entry in fitting}) != 1:
+                lookup.choose(self.stored, parts[0] if not fitting else name, self.runs)
+            if not text.strip() or text in found.values():
+                raise OptionError(
+                    f"--label {printable(word)}: write ENTRY=TEXT, and another text for each entry"
+                )
+            found |= {entry.key: text for entry in fitting}
+        return found
+
+    def shown(self, entry: EntryResults) -> EntryResults:
+        """Return an entry under the reader's name for it."""
+        text = self._own_labels.get((entry.task, entry.task_hash, entry.name)) if self.labels else None
+        return entry.labeled(text) if text else entry
 
     @property
     def of_tasks(self) -> str:
@@ -119,6 +155,7 @@ def collect(selection: Selection) -> tuple[list[EntryResults], list[str]]:
             continue
         if entry is not None:
             refused += entry.refused
+            entry = selection.shown(entry)
             good.setdefault((entry.task, entry.task_hash, entry.record.name), []).append(entry)
     collected = []
     for kinds in map(by_code, good.values()):
@@ -291,7 +328,7 @@ def _every_copy(selection: Selection, name: str) -> list[EntryResults]:
         place = f"{selection.runs}, {selection.of_tasks.removeprefix(' of ')}" if tasks else selection.runs
         key = lookup.choose(list({e.key: e for e in meant}.values()), name, place).key
         folders = [entry.store for entry in everything if entry.key == key]
-    copies = [entry for store in folders if (entry := read(store)) is not None]
+    copies = [selection.shown(entry) for store in folders if (entry := read(store)) is not None]
     if not copies:
         if any(min(store.seeds(), default=0) >= TUNING_SEEDS for store in folders):
             raise UnknownNameError(

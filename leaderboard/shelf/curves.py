@@ -66,6 +66,8 @@ class EntryResults(Shown):
         The epochs to which seeds were asked for, by seed; empty where nobody recorded it.
     withdrawn:
         Why seeds that were asked for no longer are, by seed.
+    own_label:
+        The reader's name for it, which is shown as it is; empty if there is none.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     """
@@ -81,6 +83,7 @@ class EntryResults(Shown):
     chosen_seeds: str = ""
     asked: Mapping[int, int] = field(default_factory=dict)
     withdrawn: Mapping[int, str] = field(default_factory=dict)
+    own_label: str = ""
     color: int | None = None
 
     @classmethod
@@ -131,6 +134,16 @@ class EntryResults(Shown):
 
     @property
     def label(self) -> str:
+        """The reader's name for it, or algorithm, model and the options that are not defaults, with the mark."""
+        return self.own_label or self.trained_as
+
+    @property
+    def short(self) -> str:
+        """The label without the algorithm, where others share it."""
+        return self.own_label or self.trained_as.removeprefix(f"{self.algorithm} ")
+
+    @property
+    def trained_as(self) -> str:
         """Algorithm, model and the options that are not defaults, with the mark."""
         mark = "(published)" if self.mark == BESIDE else self.mark
         return f"{self.record.label} {mark}".rstrip()
@@ -343,7 +356,7 @@ class EntryResults(Shown):
 
     def labeled(self, label: str) -> EntryResults:
         """Return the entry with a label of your own, for pictures and tables."""
-        return replace(self, record=self.record.model_copy(update={"label": label}))
+        return replace(self, own_label=label)
 
     def reaching(self, epochs: int) -> EntryResults | None:
         """Return the entry with the seeds that have reached some epochs, itself where all have; None for none."""
@@ -474,7 +487,7 @@ class EntryResults(Shown):
     def legend(self) -> str:
         """The label, with the ansatz where the model has one and the label leaves the default out."""
         ansatz = self.identity.get("model_options", {}).get("ansatz")
-        if ansatz is None or " ansatz=" in self.label:
+        if self.own_label or ansatz is None or " ansatz=" in self.label:
             return self.label
         return f"{self.label} ansatz={ansatz}"
 

@@ -363,7 +363,7 @@ def diagnose_ansatz(
     options = options or {}
     for wrong in options.keys() & {"name", "qubits", "layers"}:
         raise OptionError(
-            f"{wrong}={options[wrong]}: no option of an ansatz; sizes are `--qubits` and `--layers`"
+            f"{wrong}={options[wrong]}: no option of an ansatz; sizes are `qubits` and `layers`"
         )
     laws = _laws(layers)
     told = name if isinstance(name, str) else getattr(name, "__name__", "circuit")

@@ -83,6 +83,7 @@ def board(
     entries: Sequence[str | EntryResults] = (),
     study: str | None = None,
     all_codes: bool = False,
+    labels: Mapping[str, str] | Sequence[str] = (),
 ) -> Leaderboard:
     """Rank entries by significant outperformance: on a task, on each task, or over several tasks together.
 
@@ -115,6 +116,8 @@ def board(
         Rank the entries of this study only: its name, or a study file's path.
     all_codes:
         Show entries of every code, and not only of the newest code with 20 seeds or more.
+    labels:
+        Names of your own by entry, which are shown as they are.
 
     Returns
     -------
@@ -143,7 +146,7 @@ def board(
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
-    written = replace(Selection.create(runs, task, published), all_codes=all_codes)
+    written = replace(Selection.create(runs, task, published, labels), all_codes=all_codes)
     selection = written.named()
     together = selection.tasks if len(selection.tasks) > 1 else ()
     if rule is not None and (together or by != "steps"):
@@ -231,6 +234,7 @@ def compare(
     runs: str | PathLike[str] = "runs",
     published: bool = False,
     rule: str | None = None,
+    labels: Mapping[str, str] | Sequence[str] = (),
 ) -> EntryComparison:
     """Compare two entries: which needs fewer steps, by how much and how surely.
 
@@ -245,6 +249,8 @@ def compare(
         As for `load`.
     rule:
         As for `board`: the rule for significance in a cell.
+    labels:
+        As for `board`.
 
     Returns
     -------
@@ -269,7 +275,7 @@ def compare(
     >>> round(found.difference, 2), found.p < 0.0002
     (-0.53, True)
     """
-    selection = Selection.create(runs, task, published).named()
+    selection = Selection.create(runs, task, published, labels).named()
 
     def find(entry: str | EntryResults, beside: str | EntryResults) -> EntryResults:
         if isinstance(entry, EntryResults):

@@ -107,4 +107,10 @@ PublishedOption = Annotated[
     bool,
     typer.Option("--published", help="With the published entries that come with the suite."),
 ]
+LabelOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--label", metavar="ENTRY=TEXT", help="Your own name for an entry, shown as it is. Repeatable."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]

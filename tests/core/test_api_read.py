@@ -86,6 +86,14 @@ def test_a_comparison_is_numbers_and_a_sentence(small: EntryResults, large: Entr
     assert found.as_dict()["verdict"] == str(found.sentence)
 
 
+def test_nothing_is_appended_to_a_name_of_one_s_own() -> None:
+    circuit = api.load("vqc-native qubits=6", task="beam6g", **WHERE)
+    assert circuit.legend.endswith(" ansatz=iqp")
+    assert {circuit.labeled("mine").legend, circuit.labeled("mine").short, circuit.labeled("mine").label} == {
+        "mine"
+    }
+
+
 def test_the_first_names_are_for_users() -> None:
     assert set(dir(qrlsuite)) == set(qrlsuite.__all__) >= {"compare", "power"}
     assert "power" in dir(api)

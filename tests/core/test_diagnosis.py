@@ -127,12 +127,12 @@ def test_what_has_no_states_has_no_entanglement(kept: Train) -> None:
 
 def test_a_circuit_over_its_size(tmp_path: Path) -> None:
     picture = tmp_path / "c.svg"
-    words = ("diagnose", "ansatz", "cz", "gate=xyz", "--qubits", "1:3", "--draws", 5)
-    text = " ".join(qrlsuite(*words, "--layers", "n", "--out", picture).split())
+    words = ("diagnose", "ansatz", "cz", "gate=xyz", "qubits=1:3", "--draws", 5)
+    text = " ".join(qrlsuite(*words, "layers=n", "--out", picture).split())
     assert "with each further qubit" in text
     assert "layers = n" in text
     assert "global" in picture.read_text()
-    sizes = json.loads(qrlsuite(*words, "--layers", "1,2", "--json"))["sizes"]
+    sizes = json.loads(qrlsuite(*words, "layers=1,2", "--json"))["sizes"]
     assert [(each["qubits"], each["layers"]) for each in sizes] == [
         (n, law) for law in (1, 2) for n in (1, 2, 3)
     ]
@@ -166,11 +166,10 @@ def test_functions_of_one_s_own_and_large_circuits() -> None:
         (("ansatz",), "give the name of one ansatz"),
         (("ansatz", "iqp", "cz"), "give the name of one ansatz"),
         (("ansatz", "iqpp"), "iqp"),
-        (("ansatz", "iqp", "--qubits", "4-12"), "qubits '4-12': write one number"),
-        (("ansatz", "iqp", "--qubits", "12:4"), "qubits '12:4': write one number"),
-        (("ansatz", "iqp", "--qubits", "2:25"), "backend 'native' takes at most 20"),
-        (("ansatz", "iqp", "--layers", "0n"), "layers '0n': write one number"),
-        (("ansatz", "iqp", "qubits=4"), "sizes are `--qubits` and `--layers`"),
+        (("ansatz", "iqp", "qubits=4-12"), "qubits '4-12': write one number"),
+        (("ansatz", "iqp", "qubits=12:4"), "qubits '12:4': write one number"),
+        (("ansatz", "iqp", "qubits=2:25"), "backend 'native' takes at most 20"),
+        (("ansatz", "iqp", "layers=0n"), "layers '0n': write one number"),
         (("no-such-entry",), "no-such-entry"),
     ],
 )

@@ -523,3 +523,27 @@ def test_a_folder_of_other_programs_is_answered_with_what_to_type(
         f"{logs} holds 3 evaluations.npz: qrlsuite import '{logs}'/*/*/evaluations.npz maximum=500, where 500"
     )
     assert said in refused("import", logs, *options)
+
+
+def test_names_of_one_s_own_are_shown_as_they_are(
+    qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path
+) -> None:
+    qrlsuite("import", csv, "maximum=100")
+    own = ["--label", "fast=Ours, lr=0.1", "--label", "slow lr=0.01=external baseline"]
+    assert qrlsuite("compare", "fast", "slow", *own).stdout.startswith("Ours, lr=0.1 needs")
+    table = qrlsuite("leaderboard", *own, "--format", "csv").stdout
+    assert [name in table for name in ("Ours, lr=0.1", "external baseline", "slow lr")] == [True, True, False]
+    qrlsuite("plot", "curves", *own, "--out", tmp_path / "curves.svg")
+    figure = api.plot(
+        "curves", entries=[api.load("fast").labeled("a" * 70 + "1"), api.load("slow").labeled("a" * 70 + "2")]
+    )
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [text.partition("  ")[0][-1] for text in texts[:2]] == ["1", "2"], (
+        "never cut so that two are alike"
+    )
+    for words, message in (
+        (["--label", "fest=x"], "no entry 'fest' in runs"),
+        (["--label", "fast=x", "--label", "slow=x"], "another text for each entry"),
+        (["--label", "fast"], "--label fast: write ENTRY=TEXT"),
+    ):
+        assert message in refused("compare", "fast", "slow", *words)

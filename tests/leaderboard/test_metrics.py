@@ -217,7 +217,7 @@ def test_curves_of_other_programs_may_be_costs(tmp_path: Path) -> None:
         "below",
         "regret 7, delta 0.5",
     )
-    assert "thresholds 7, 8.5 on regret, less is better" in import_curves.told(done)[1]
+    assert "thresholds 7, 8.5 on regret, less is better" in import_curves.told(done)[-1]
     [section] = api.board(runs=tmp_path).sections
     assert [row.entry.label for row in section.times.rows] == ["external a", "external b"]
     for more, problem in (

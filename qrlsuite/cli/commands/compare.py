@@ -13,6 +13,7 @@ from qrlsuite import api
 from qrlsuite.cli.arguments import (
     AmongOption,
     JsonOption,
+    LabelOption,
     PublishedOption,
     RuleOption,
     RunsOption,
@@ -37,6 +38,7 @@ def compare(
     ],
     task: AmongOption = None,
     rule: RuleOption = None,
+    label: LabelOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -48,7 +50,9 @@ def compare(
 
     Example: qrlsuite compare --task beam6g "mlp width=64" "mlp width=16"
     """
-    comparison = api.compare(first, second, task=task, runs=runs, published=published, rule=rule)
+    comparison = api.compare(
+        first, second, task=task, runs=runs, published=published, rule=rule, labels=label or ()
+    )
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))
         return

@@ -21,19 +21,11 @@ def diagnose(
         list[str],
         typer.Argument(
             metavar="ENTRY... | ansatz NAME",
-            help="Entries of one task; or `ansatz`, its name, and its options as OPTION=VALUE.",
+            help="Entries of one task; or `ansatz`, its name, and its options as OPTION=VALUE, with sizes: qubits=6, "
+            "qubits=4:12 (both included), 2:16:2 or 4,8 (default: 2:8); layers likewise (default: 4), or n, as many as "
+            "qubits, 2n, twice as many.",
         ),
     ],
-    qubits: Annotated[
-        str,
-        typer.Option("--qubits", metavar="N", help="Of an ansatz: 6, 4:12 (both included), 2:16:2 or 4,8."),
-    ] = "2:8",
-    layers: Annotated[
-        str,
-        typer.Option(
-            "--layers", metavar="L", help="Of an ansatz, likewise; n: as many as qubits, 2n: twice as many."
-        ),
-    ] = "4",
     draws: Annotated[
         int,
         typer.Option("--draws", min=2, help="Of an ansatz: random parameters for the variance of gradients."),
@@ -60,13 +52,13 @@ def diagnose(
 
     Of an ansatz, a row for each size: variance of the gradient with a local and a global readout and how it changes
     with each further qubit; rank of the Fisher information, effective dimension, mean frequency along the inputs,
-    expressibility, entanglement, dimension of the dynamical Lie algebra. --layers says by which law depth grows.
+    expressibility, entanglement, dimension of the dynamical Lie algebra. layers=n says by which law depth grows.
 
     Of entries, the best trained agents beside the same before training, at the states where they were: rank, gauge
     directions and effective dimension, mean frequency, and of circuits the entanglement. Networks without a circuit
     have all but the last.
 
-    Example: qrlsuite diagnose ansatz iqp --qubits 4:12 --out iqp.png
+    Example: qrlsuite diagnose ansatz iqp qubits=4:12 --out iqp.png
 
     Example: qrlsuite diagnose "vqc-native qubits=6" --task beam6g --published
     """
@@ -75,10 +67,11 @@ def diagnose(
     found: diagnosis.CircuitDiagnosis | diagnosis.AgentsDiagnosis
     if words[0] == "ansatz":
         names, settings = split_settings(words[1:])
+        sizes = [str(settings.pop(name, usual)) for name, usual in (("qubits", "2:8"), ("layers", "4"))]
         if len(names) != 1:
             raise OptionError("give the name of one ansatz, as in `qrlsuite diagnose ansatz iqp`")
         found = diagnosis.diagnose_ansatz(
-            names[0], qubits, layers, draws=draws, seed=seed, options=settings, progress=quiet
+            names[0], *sizes, draws=draws, seed=seed, options=settings, progress=quiet
         )
     else:
         found = diagnosis.diagnose(

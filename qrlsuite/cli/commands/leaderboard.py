@@ -16,6 +16,7 @@ from qrlsuite.cli.arguments import (
     AlphaOption,
     EntryOption,
     HorizonOption,
+    LabelOption,
     PublishedOption,
     RunsOption,
     TasksOption,
@@ -43,6 +44,7 @@ class Format(StrEnum):
 def leaderboard(
     task: TasksOption = None,
     entry: EntryOption = None,
+    label: LabelOption = None,
     study: Annotated[
         str | None,
         typer.Option(
@@ -126,6 +128,7 @@ def leaderboard(
         "horizon": horizon,
         "entries": entry or (),
         "all_codes": all_codes,
+        "labels": label or (),
     }
     if format_ is Format.html:
         path, refused = write_page(output, Selection.create(runs, tasks, published), **asked)

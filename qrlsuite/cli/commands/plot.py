@@ -14,6 +14,7 @@ from qrlsuite.cli.arguments import (
     EntryOption,
     HorizonOption,
     JsonOption,
+    LabelOption,
     PublishedOption,
     RunsOption,
     split_settings,
@@ -51,6 +52,7 @@ def plot(
         ),
     ] = None,
     entry: EntryOption = None,
+    label: LabelOption = None,
     study: Annotated[
         list[str] | None,
         typer.Option(
@@ -92,7 +94,7 @@ def plot(
     picture_settings, environment_settings = _split(settings or [])
     drawn = draw_picture(
         kind,
-        Selection.create(runs, task, published),
+        Selection.create(runs, task, published, label),
         entry or [],
         study or [],
         horizon=horizon,
