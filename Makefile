@@ -102,25 +102,26 @@ demo-of-wheel: dist
 	mkdir -p $(VENV)-wheel/elsewhere
 	cd $(VENV)-wheel/elsewhere && ../bin/qrlsuite demo
 
+# By uv, which takes a sixth of pip's processor time and shows what it downloads; by pip where uv does not find all of it:
+# it does not read pip's settings, an index of your own for example.
+UV := $(BIN)/uv pip install --python $(BIN)/python
+
 install: $(BIN)/python
 	rm -f $(VENV)/editable
-	@echo 'installing qrlsuite and what it needs'
-	$(BIN)/pip install --quiet .
+	@echo 'installing qrlsuite and what it needs: 60 packages, a download of 270 MB; 2 GB in all'
+	$(UV) . || $(BIN)/pip install .
 
 install-dev: $(VENV)/editable
 
-# By uv, which takes a sixth of pip's processor time; by pip where uv does not find all of it: it does not read pip's
-# settings, an index of your own for example.
 $(VENV)/editable: pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[dev,docs]' \
-	  || $(BIN)/pip install --quiet --editable '.[dev,docs]'
+	@echo 'installing qrlsuite, what it needs and what its tests need'
+	$(UV) --editable '.[dev,docs]' || $(BIN)/pip install --editable '.[dev,docs]'
 	touch $@
 
 # The CPU build of torch first: a plain install would bring gigabytes of CUDA packages. With an NVIDIA GPU,
 # install the torch of your choice into $(VENV) before anything else; it is kept.
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet uv
 	@echo 'installing torch into $(VENV): a download of 200 MB'
-	$(BIN)/pip install --quiet 'torch==$(TORCH)+cpu' 2>/dev/null \
-	  || $(BIN)/pip install --quiet torch --index-url https://download.pytorch.org/whl/cpu \
-	  || $(BIN)/pip install --quiet torch
+	$(BIN)/pip install 'torch==$(TORCH)+cpu' 2>/dev/null || $(UV) --torch-backend cpu torch || $(BIN)/pip install torch

@@ -173,8 +173,10 @@ class ModelSpec(NumericSpec):
         Reference to `population(modules, options) -> torch.nn.Module`: S built modules as one that maps
         (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
         `qrlsuite.population.stack`.
-    faster:
-        Name of a model that computes the same function much faster; recommended where training takes hours.
+    faster, speedup:
+        Name of a model that computes the same function much faster, and by how much: `run` says so before it trains.
+    quick:
+        Seeds and epochs of `run --quick`: at most two minutes of two cores.
     backends:
         Whether it is a model for each circuit backend, of plugins too: registered as `NAME-BACKEND`, with the options
         `options["BACKEND"]`, which `qrlsuite.circuit.options_on` makes.
@@ -187,6 +189,8 @@ class ModelSpec(NumericSpec):
     build: str
     population: str | None = None
     faster: str | None = None
+    speedup: str = "much faster"
+    quick: tuple[int, int] = (8, 10)
     backends: bool = False
 
     def __post_init__(self) -> None:
@@ -205,6 +209,8 @@ class ModelSpec(NumericSpec):
             summary=f"{self.summary}; backend: {backend.summary.partition(';')[0]}",
             options=f"{self.options}[{backend.name}]",
             faster=None if name == self.faster else self.faster,
+            speedup=backend.speedup or self.speedup,
+            quick=backend.quick or self.quick,
             backends=False,
         )
 
@@ -308,6 +314,8 @@ class CircuitBackendSpec(NumericSpec):
     max_qubits:
         How many qubits it computes together; None stands for any number. A circuit in which gates or observables
         connect more is refused, and one with more that are not connected is given to it in parts.
+    speedup, quick:
+        Of its models, see `ModelSpec`; None: as theirs.
     """
 
     kind, kinds = "circuit_backend", "circuit_backends"
@@ -317,6 +325,8 @@ class CircuitBackendSpec(NumericSpec):
     mean_field: bool = False
     products: bool = False
     max_qubits: int | None = 20
+    speedup: str | None = None
+    quick: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         Spec.__post_init__(self)

@@ -322,6 +322,9 @@ class RunDisplay:
         end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
         self.console.print("; ".join(parts) + "." + end)
         notes = [f"note: {line}" for line in self.entry.unusable(self.epochs)]
+        model = self.entry.model
+        if model.faster in registry.load().names(specs.ModelSpec):
+            notes.append(f"faster: --model {model.faster} computes the same, {model.speedup}")
         for line in [*notes, *filter(None, [self.expected])]:
             self.console.print(line, markup=False, soft_wrap=True)
         if submits:
@@ -389,13 +392,10 @@ class RunDisplay:
         if settled and not self._advised:
             self._advised, self.endless = True, left > DAY
             if left > 3600:
-                self.console.print(f"faster: {self._faster()}", markup=False, soft_wrap=True)
-
-    def _faster(self) -> str:
-        faster = self.entry.model.faster
-        if faster in registry.load().names(specs.ModelSpec):
-            return f"--model {faster} computes the same and trains many times faster"
-        return "fewer --seeds or --epochs, or --engine slurm on a cluster; what is trained stays and counts"
+                self.console.print(
+                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; all that is trained counts",
+                    soft_wrap=True,
+                )
 
     def close(self) -> None:
         """Take the live bar away."""

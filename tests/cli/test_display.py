@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from qrlsuite import registry, specs
 from qrlsuite.engine.display import Bar, CostEstimate, RunDisplay
 from qrlsuite.engine.missing import summarize
 from qrlsuite.engine.terminal import as_command
@@ -16,7 +17,7 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
-from tests.commands import say
+from tests.commands import qrlsuite, say
 
 PAIR = [SeedGroup((0, 1, 2), 0), SeedGroup((3, 4), 0)]
 
@@ -181,6 +182,39 @@ def test_the_first_rounds_tell_what_is_left_and_two_epochs_whether_that_is_long(
         lines += show(1)
     assert said in lines
     assert "faster: " not in lines
+
+
+@pytest.mark.parametrize("backend", ["pennylane", "qiskit", "native"])
+def test_a_slow_simulator_names_the_fast_one_before_it_trains(
+    backend: str, tiny_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = resolve(tiny_task, f"vqc-{backend} qubits=2 layers=1")
+    plan = Missing(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
+    RunDisplay(plan, 1).begin(submits=True)
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("faster: ")]
+    assert len(said) == (backend != "native")
+    for line in said:
+        assert re.match(r"faster: --model vqc-native computes the same, \d+ to \d+ times faster", line)
+        assert ("--set device=qrlsuite.native" in line) == (backend == "pennylane")
+
+
+SHIPPED = [
+    each.spec.name
+    for each in registry.load().of(specs.ModelSpec).values()
+    if each.distribution == "qrlsuite" and each.spec.name != specs.NO_MODEL
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("model", SHIPPED)
+def test_a_quick_run_of_every_shipped_model_ends(model: str, tmp_path: Path) -> None:
+    task = "pong" if model == "cnn" else "beam6g"
+    remembers = model.startswith(("qlstm", "qfwp", "gru", "lstm"))
+    words = ["run", f"{'drqn ' * remembers}{model}", "--task", task, "--quick", "--workers", "2"]
+    done = qrlsuite(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    seeds, epochs = registry.get(specs.ModelSpec, model).quick
+    assert re.search(rf"{seeds} seeds complete, .* after epoch {epochs}\n", done.stderr)
 
 
 def test_more_than_a_day_is_an_alarm_from_the_second_epoch_on(entry, tmp_path, capsys, clock) -> None:

@@ -36,8 +36,6 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import load
 from qrlsuite.notation import Written, parse_entry, split, write_setting
 
-QUICK_SEEDS = 8
-QUICK_EPOCHS = 10
 QUICK_QUBITS = 4
 
 
@@ -77,7 +75,7 @@ def run(
         bool,
         typer.Option(
             "--quick",
-            help=f"A small budget: {QUICK_SEEDS} seeds, {QUICK_EPOCHS} epochs, {QUICK_QUBITS} qubits.",
+            help=f"A small budget: 8 seeds, 10 epochs, {QUICK_QUBITS} qubits; less of what is slow.",
         ),
     ] = False,
     start: Annotated[
@@ -111,11 +109,13 @@ def run(
     """
     where = where_of(engine, workers, device, same)
     written = _written(entry or [], model, settings or [], quick)
+    chosen = resolve_entry(task, written, runs=runs)
+    quick_seeds, quick_epochs = chosen.model.quick if quick else (None, None)
     work, submitted = train_entry(
-        resolve_entry(task, written, runs=runs),
+        chosen,
         where,
-        seeds or (QUICK_SEEDS if quick else None),
-        epochs or (QUICK_EPOCHS if quick else None),
+        seeds or quick_seeds,
+        epochs or quick_epochs,
         budget,
         track or (),
         runs,
