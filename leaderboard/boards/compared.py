@@ -11,6 +11,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard.boards import tables
@@ -98,6 +99,12 @@ class EntryComparison(Shown, Comparison):
     def legend(self) -> str:
         """Meanings of the signs in the table of cells."""
         return legend(self)
+
+    def sheets(self) -> list[Sheet]:
+        """Return the table of thresholds for a file, with the verdict as its caption."""
+        heads = self.pair.columns()
+        notes = (self.verdict, *self.pair.notes, *self.further)
+        return [Sheet.of("", heads, self.pair.rows(), notes, words=(heads[0], heads[-1]), label="verdict")]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison as plain values, for JSON: the cells, and `verdict` and `times` beside them."""

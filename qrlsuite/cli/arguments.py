@@ -113,4 +113,7 @@ LabelOption = Annotated[
         "--label", metavar="ENTRY=TEXT", help="Your own name for an entry, shown as it is. Repeatable."
     ),
 ]
+TableFileOption = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE", help="Write the table to this tex or md file.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from operator import itemgetter
+from pathlib import Path
 from typing import Any, Literal
 
 from rich import box
@@ -21,6 +22,7 @@ from rich.text import Text
 
 from qrlsuite.columns import Column
 from qrlsuite.engine.terminal import printable
+from qrlsuite.errors import OptionError
 
 WIDE = 165
 """Characters per line of a table that is written into a pipe or a file."""
@@ -199,15 +201,16 @@ class Sheet:
         )
 
     def latex(self) -> str:
-        """Return a table for a paper; it needs the package booktabs and nothing else."""
+        """Return a table for a paper, further notes as comments; it needs the package booktabs and nothing else."""
         spec = "".join("l" if column.words else "r" for column in self.columns)
-        caption = " ".join(
-            f"{escaped(line[:1].upper() + line[1:])}." for line in (self.title, *self.remarks())
-        )
+        first, *others = self.remarks() or [""]
+        caption = "; ".join(filter(None, (self.title, first)))
+        caption = escaped(caption if caption.endswith(("?", ".")) else f"{caption}.")
         lines = [" & ".join(map(_math, row)) + r" \\" for row in self.cells]
         return "\n".join(
             [
                 "% needs \\usepackage{booktabs}",
+                *(f"% {escaped(line)}" for line in others),
                 r"\begin{table*}",
                 r"  \centering",
                 rf"  \caption{{{caption}}}",
@@ -223,6 +226,17 @@ class Sheet:
                 "",
             ]
         )
+
+
+WRITTEN = {".tex": Sheet.latex, ".md": Sheet.markdown}
+"""How tables are written into a file, by its ending."""
+
+
+def text_of(sheets: Iterable[Sheet], path: Path) -> str:
+    """Return tables as the text of a file."""
+    if path.suffix not in WRITTEN:
+        raise OptionError(f"--out {path}: a table is written to a file that ends with {' or '.join(WRITTEN)}")
+    return "\n".join(map(WRITTEN[path.suffix], sheets))
 
 
 def _plain(text: str, further: str = "`|") -> str:
@@ -300,12 +314,12 @@ def escaped(text: str) -> str:
 
 
 def _math(cell: str) -> str:
-    """Write a cell, its sign or range as LaTeX sets them."""
+    """Write a cell, its signs or range as LaTeX sets them."""
     if cell == "-":
         return "--"
     if cell.startswith(">= "):
         return r"$\geq$ " + escaped(cell[3:])
-    if cell[:1] in "+-" and cell[1:2].isdigit():
-        return f"${cell[0]}$" + escaped(cell[1:])
     best, dash, worst = cell.partition("-")
-    return f"{best}--{worst}" if dash and best.isdigit() and worst.isdigit() else escaped(cell)
+    if dash and best.isdigit() and worst.isdigit():
+        return f"{best}--{worst}"
+    return re.sub(r"(?<![\w.])[+-](?=\d)", r"$\g<0>$", escaped(cell))

@@ -117,7 +117,7 @@ class Overview(Shown):
             yield Text(file.source)
         if file.reports:
             yield Text(f"Reported there: {file.reports}")
-        yield self._sheet() if self.works else Text("nothing to train")
+        yield self.sheets()[0] if self.works else Text("nothing to train")
         lacking = [each for each in self._measured if each[0].groups]
         if self.works and not lacking:
             yield Text("everything is there")
@@ -135,7 +135,8 @@ class Overview(Shown):
         yield Text(f"pictures: {', '.join(f'{p.name} ({p.kind})' for p in file.pictures)}")
         yield from map(Text, self.submitted)
 
-    def _sheet(self) -> Sheet:
+    def sheets(self) -> list[Sheet]:
+        """Return the table of entries."""
         with_published = ("published",) if self.published is not None else ()
         heads = ("task", "entry", "seeds", *with_published, "epochs", "core time left")
         rows = []
@@ -151,7 +152,7 @@ class Overview(Shown):
                 "-" if cost == 0 else "?" if span is None else duration_range(*span),
             )
             rows.append(cells)
-        return Sheet.of("", heads, rows, words=("task", "entry", "core time left"))
+        return [Sheet.of("", heads, rows, words=("task", "entry", "core time left"))]
 
 
 def _finished(work: Missing) -> int:

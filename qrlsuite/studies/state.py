@@ -234,10 +234,10 @@ class State(Shown):
         yield Text(f"{study.name}: {study.file.summary}", style="bold")
         if not self.begun:
             yield from map(Text, self._design())
-        for asked, pairs in by_question(study, list(zip(self.pairs, facts["pairs"]))):
-            if asked:
-                yield Text(asked, style="bold")
-            yield _sheet(self, pairs)
+        for sheet in self.sheets():
+            if sheet.title:
+                yield Text(sheet.title, style="bold")
+            yield replace(sheet, title="")
         if any(pair.p for pair in self.pairs):
             yield Text(
                 "B against A: how many more steps B needs, on average over the thresholds (+52% = B is slower), with "
@@ -258,6 +258,14 @@ class State(Shown):
             yield Text(f"look at {seeds} seeds taken {when}")
         yield from map(Text, filter(None, (reason_note(study), lost_note(self))))
         yield from map(Text, self._cost(facts))
+
+    def sheets(self) -> list[Sheet]:
+        """Return a table of pairs for each question."""
+        pairs = list(zip(self.pairs, self.as_dict()["pairs"]))
+        return [
+            replace(_sheet(self, of), title=asked, label=self.study.name)
+            for asked, of in by_question(self.study, pairs)
+        ]
 
     def late(self, pair: PairDecision) -> bool:
         """Tell whether a pair is not known to differ, and cannot be: both entries hardly leave the horizon."""

@@ -130,9 +130,9 @@ class StudiesTogether(Shown):
         """Show a table for each question, with explanations."""
         names = ", ".join(each.study.name for each in self.studies)
         yield Text(f"{names}: B against A, on each task and on average", style="bold")
-        for asked in dict.fromkeys(pair.question for pair in self.pairs):
-            yield from [Text(asked, style="bold")] * bool(asked)
-            yield Sheet("", self.columns(), [pair for pair in self.pairs if pair.question == asked])
+        for sheet in self.sheets():
+            yield from [Text(sheet.title, style="bold")] * bool(sheet.title)
+            yield replace(sheet, title="")
         yield Text(
             "B against A: how many more steps B needs (+52% = B is slower), by the first look's seeds of each study "
             f"({', '.join(map(str, self.seeds))}), which no early stop can bias; mean: of the ratios, over these "
@@ -143,6 +143,11 @@ class StudiesTogether(Shown):
         yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
             yield Text(f"entries with other options on another task: {', '.join(self.changed)}")
+
+    def sheets(self) -> list[Sheet]:
+        """Return a table of pairs for each question."""
+        asked = dict.fromkeys(pair.question for pair in self.pairs)
+        return [Sheet(text, self.columns(), [p for p in self.pairs if p.question == text]) for text in asked]
 
 
 def together(studies: Sequence[State]) -> StudiesTogether:

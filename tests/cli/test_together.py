@@ -18,7 +18,7 @@ from tests.commands import answer, say
 TOGETHER = ("quantum-or-not", "quantum-or-not-degree5", "quantum-or-not-a3-0")
 
 
-def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks() -> None:
+def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks(tmp_path: Path) -> None:
     found = answer("show", *TOGETHER)
     outcomes = [api.read_study(name) for name in TOGETHER]
     assert found["tasks"] == ["beam6g", "beam6g-degree5", "beam6g-a3-0"]
@@ -36,6 +36,8 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks()
     shown = say("show", "study", *TOGETHER).stdout
     assert "nothing follows for other tasks" in shown
     assert shown.count("10 qubits / width 14") == 1
+    say("show", "study", *TOGETHER, "--out", str(tmp_path / "table.tex"))
+    assert (tmp_path / "table.tex").read_text().count("10 qubits / width 14 & ") == 1
 
 
 def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path) -> None:

@@ -533,6 +533,13 @@ def test_names_of_one_s_own_are_shown_as_they_are(
     assert qrlsuite("compare", "fast", "slow", *own).stdout.startswith("Ours, lr=0.1 needs")
     table = qrlsuite("leaderboard", *own, "--format", "csv").stdout
     assert [name in table for name in ("Ours, lr=0.1", "external baseline", "slow lr")] == [True, True, False]
+    qrlsuite("compare", "fast", "slow", *own, "--out", "verdict.tex")
+    verdict = (tmp_path / "verdict.tex").read_text()
+    assert r"\caption{Ours, lr=0.1 needs 57\% fewer steps than external baseline (" in verdict
+    qrlsuite("leaderboard", *own, "--out", "board.tex")
+    assert r"& Ours, lr=0.1 & $" not in (board := (tmp_path / "board.tex").read_text())
+    assert "1 & Ours, lr=0.1 & 2.95k" in board
+    assert "end it with .html, .tex, .md" in refused("leaderboard", "--out", "board.txt")
     qrlsuite("plot", "curves", *own, "--out", tmp_path / "curves.svg")
     figure = api.plot(
         "curves", entries=[api.load("fast").labeled("a" * 70 + "1"), api.load("slow").labeled("a" * 70 + "2")]

@@ -17,9 +17,12 @@ from qrlsuite.cli.arguments import (
     PublishedOption,
     RuleOption,
     RunsOption,
+    TableFileOption,
     entries_here,
 )
+from qrlsuite.engine.sheet import text_of
 from qrlsuite.engine.terminal import command
+from qrlsuite.results.store import write_atomically
 from qrlsuite.statistics import Direction
 
 
@@ -39,6 +42,7 @@ def compare(
     task: AmongOption = None,
     rule: RuleOption = None,
     label: LabelOption = None,
+    out: TableFileOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -55,6 +59,10 @@ def compare(
     )
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))
+        return
+    if out is not None:
+        write_atomically(out, text_of(comparison.sheets(), out).encode())
+        typer.echo(f"wrote {out}")
         return
     Console().print(comparison)
     pair = comparison.pair.times

@@ -22,12 +22,13 @@ from qrlsuite.cli.arguments import (
     TasksOption,
     names_of,
 )
-from qrlsuite.engine.sheet import WIDE, Sheet, csv_rows
+from qrlsuite.engine.sheet import WIDE, csv_rows
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.leaderboard.boards.board import AXES
+from qrlsuite.leaderboard.boards.board import AXES, Leaderboard
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf.collect import Selection
+from qrlsuite.results.store import write_atomically
 
 
 class Format(StrEnum):
@@ -39,6 +40,15 @@ class Format(StrEnum):
     csv = "csv"
     html = "html"
     latex = "latex"
+
+
+ENDINGS = {
+    ".html": Format.html,
+    ".tex": Format.latex,
+    ".md": Format.markdown,
+    ".csv": Format.csv,
+    ".json": Format.json,
+}
 
 
 def leaderboard(
@@ -58,7 +68,10 @@ def leaderboard(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="For html; default: leaderboard.html in the results folder."
+            "--out",
+            metavar="FILE",
+            help="Write to this html, tex, md, csv or json file; of html, default: leaderboard.html in the results "
+            "folder.",
         ),
     ] = None,
     rule: Annotated[
@@ -116,8 +129,9 @@ def leaderboard(
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
-    if output is not None and format_ is not Format.html:
-        raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
+    format_ = format_ if output is None else ENDINGS.get(output.suffix, format_)
+    if output is not None and format_ is Format.table:
+        raise OptionError(f"--out {output}: end it with {', '.join(ENDINGS)}")
     tasks = list(task or ())
 
     asked: dict[str, Any] = {
@@ -138,16 +152,21 @@ def leaderboard(
         typer.echo(f"wrote {path}")
         return
     board = api.board(tasks, runs=runs, published=published, **asked)
-    if format_ is Format.json:
-        typer.echo(json.dumps(board.as_dict()))
+    if format_ is not Format.json:
+        _left_out(board.refused)
+        if not board.sections:
+            raise _nothing(runs, tasks)
+    if format_ is Format.table:
+        console = table_console(WIDE)
+        for sheet in board.sheets(explain):
+            console.print(sheet)
         return
-    _left_out(board.refused)
-    if not board.sections:
-        raise _nothing(runs, tasks)
-    if format_ is Format.csv:
-        typer.echo(csv_rows(board.flat()), nl=False)
+    text = _text(board, explain, format_)
+    if output is None:
+        typer.echo(text, nl=False)
     else:
-        _write(board.sheets(explain), format_)
+        write_atomically(output, text.encode())
+        typer.echo(f"wrote {output}")
 
 
 def _left_out(lines: Sequence[str]) -> None:
@@ -162,13 +181,13 @@ def _nothing(runs: Path, tasks: Sequence[str]) -> UnknownNameError:
     )
 
 
-def _write(sheets: Sequence[Sheet], format_: Format) -> None:
-    """Write tables to the terminal, or as text."""
-    if format_ is Format.markdown:
-        typer.echo("\n".join(sheet.markdown() for sheet in sheets))
-    elif format_ is Format.latex:
-        typer.echo("\n".join(sheet.latex() for sheet in sheets), nl=False)
-    else:
-        console = table_console(WIDE)
-        for sheet in sheets:
-            console.print(sheet)
+def _text(board: Leaderboard, explain: bool, format_: Format) -> str:
+    """Return tables as the text of a file."""
+    match format_:
+        case Format.json:
+            return json.dumps(board.as_dict()) + "\n"
+        case Format.csv:
+            return csv_rows(board.flat())
+        case Format.markdown:
+            return "\n".join(sheet.markdown() for sheet in board.sheets(explain)) + "\n"
+    return "\n".join(sheet.latex() for sheet in board.sheets(explain))

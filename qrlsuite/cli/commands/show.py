@@ -10,7 +10,9 @@ import typer
 
 from qrlsuite.api.showing import describe, is_study
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, split_settings
+from qrlsuite.engine.sheet import text_of
 from qrlsuite.engine.terminal import printable_lines, table_console
+from qrlsuite.results.store import write_atomically
 
 
 def show(
@@ -30,7 +32,11 @@ def show(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="For an ansatz: draw to this png, pdf or svg file."),
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="Of an ansatz: draw to this png, pdf or svg file. Of a study: write the table to this tex or md file.",
+        ),
     ] = None,
     format: Annotated[
         str | None,
@@ -60,7 +66,7 @@ def show(
     """
     names, settings = split_settings(words)
     studies = names if name == "study" else [name, *names] if is_study(name) else []
-    if len(studies) > 1 and not (settings or code or out or format):
+    if len(studies) > 1 and not (settings or code or format):
         from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
 
         found: Any = read_study(*studies, runs=runs)
@@ -75,6 +81,9 @@ def show(
         )
     if json_output:
         typer.echo(json.dumps(found if isinstance(found, dict) else found.as_dict()))
+    elif not isinstance(found, dict) and out is not None:
+        write_atomically(out, text_of(found.sheets(), out).encode())
+        typer.echo(f"wrote {out}")
     elif not isinstance(found, dict):
         table_console().print(found, soft_wrap=True)
     elif format is not None and "text" in found:
