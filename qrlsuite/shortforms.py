@@ -12,7 +12,8 @@ dataclass, may replace further parameters, as in a package. The name is the func
 hyphens, the summary the first line of its docstring.
 
 A model's class attribute `family = "quantum"` says that it is one; otherwise it is one where its `__init__` or module
-says `qrlsuite.layer`. Episodes of an environment end after 1000 steps.
+says `qrlsuite.layer`. Class attributes `shared` of a model and `repeats` of an environment are those of the spec.
+Episodes of an environment end after 1000 steps.
 """
 
 from __future__ import annotations
@@ -332,7 +333,12 @@ def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Sp
         cls.quantum_parameters = circuit_parameters
     family: Any = getattr(cls, "family", None) or ("quantum" if _uses_circuits(cls) else "classical")
     return specs.ModelSpec(
-        name, summary, family=family, options=holder.put("options", options), build=holder.put("build", build)
+        name,
+        summary,
+        family=family,
+        options=holder.put("options", options),
+        build=holder.put("build", build),
+        shared=getattr(cls, "shared", ()),
     )
 
 
@@ -370,6 +376,7 @@ def _environment(cls: type[Any], name: str, summary: str, holder: _Holder) -> sp
         options=holder.put("options", options),
         gymnasium_id=f"{holder.module.__name__}/{cls.__name__}-v0",
         entry_point=holder.put("make", make),
+        repeats=getattr(cls, "repeats", False),
     )
 
 

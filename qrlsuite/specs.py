@@ -95,6 +95,11 @@ class NumericSpec(Spec):
 
     numerics: int = field(default=1, kw_only=True)
 
+    @property
+    def declared(self) -> str:
+        """What seeds have in common by declaration, for the notes of boards; empty for nothing."""
+        return ""
+
 
 @dataclass(frozen=True, slots=True)
 class PictureSpec(Spec):
@@ -139,6 +144,8 @@ class EnvironmentSpec(NumericSpec):
     views:
         Options that change agents' observations alone, neither events nor rewards: a study with looks compares entries
         of tasks that differ in these options only.
+    repeats:
+        Whether all seeds are meant to meet the same episodes: one, or a fixed cycle of levels. Boards say so.
     """
 
     kind, kinds = "environment", "environments"
@@ -150,6 +157,12 @@ class EnvironmentSpec(NumericSpec):
     policies: dict[str, str] = field(default_factory=dict)
     pictures: tuple[PictureSpec, ...] = ()
     views: tuple[str, ...] = ()
+    repeats: bool = False
+
+    @property
+    def declared(self) -> str:
+        """As for all parts."""
+        return f"{self.title}: the same episodes" * self.repeats
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +193,8 @@ class ModelSpec(NumericSpec):
     backends:
         Whether it is a model for each circuit backend, of plugins too: registered as `NAME-BACKEND`, with the options
         `options["BACKEND"]`, which `qrlsuite.circuit.options_on` makes.
+    shared:
+        Names of parameters with which all seeds are meant to begin alike, such as fixed features. Boards say so.
     """
 
     kind, kinds = "model", "models"
@@ -192,9 +207,21 @@ class ModelSpec(NumericSpec):
     speedup: str = "much faster"
     quick: tuple[int, int] = (8, 10)
     backends: bool = False
+    shared: tuple[str, ...] = ()
+
+    @property
+    def declared(self) -> str:
+        """As for all parts."""
+        return f"{self.title}: the same {', '.join(self.shared)} at the beginning" * bool(self.shared)
 
     def __post_init__(self) -> None:
         Spec.__post_init__(self)
+        if not isinstance(self.shared, tuple | list) or not all(
+            isinstance(name, str) for name in self.shared
+        ):
+            raise PluginError(
+                f"model '{self.name}': shared = {self.shared!r} must name parameters, in a tuple of texts"
+            )
         if self.family not in ("classical", "quantum"):
             raise PluginError(
                 f"model '{self.name}': family {self.family!r} is neither 'classical' nor 'quantum'"

@@ -233,6 +233,9 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
             for entry in entries
             if START in entry.identity
         },
+        "seeds have in common by declaration": {
+            entry.label: "; ".join(entry.declared) for entry in entries if entry.declared
+        },
         "diverged (numbers of the agents are no longer finite), judged with the scores that they had": {
             entry.label: _of_seeds(entry) for entry in entries if entry.diverged
         },

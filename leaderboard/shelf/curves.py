@@ -334,6 +334,11 @@ class EntryResults(Shown):
         probed = {probe.result for probe in probes.of_records(self._run_records)}
         return probes.EQUAL not in probed and any(map(probes.third_party, self._made_with))
 
+    @property
+    def declared(self) -> list[str]:
+        """What its seeds have in common by declaration of the plugins."""
+        return sorted({line for probe in probes.of_records(self._run_records) for line in probe.declared})
+
     @cached_property
     def codes(self) -> tuple[str, ...]:
         """Digests of the code of its seeds; none where all is the suite's with its first bits, or unknown."""

@@ -184,7 +184,7 @@ def train_entry(
     if put_agents is not None:
         put_agents(work.store)
     if work.groups:
-        missing.require_trainable([entry], where)
+        missing.require_trainable([entry], where, quiet)
     display = RunDisplay(work, where.workers, quiet)
     display.expected = None if quiet else missing.expected(work, where)
     with trackers.asking([track] if isinstance(track, str) else list(track)):

@@ -120,10 +120,15 @@ def _require_loadable(entry: Entry, store: EntryStore) -> None:
         ) from error
 
 
-def require_trainable(entries: Sequence[Entry], where: Where) -> None:
-    """Refuse entries whose parts do not fit (wrong actions, say), before anything is trained or queued."""
+def require_trainable(entries: Sequence[Entry], where: Where, quiet: bool = False) -> None:
+    """Refuse entries whose parts do not fit (wrong actions, say), before anything is trained or queued.
+
+    Seeds of third-party code that would share weights or episodes are refused, too; unless `quiet`, a question that got
+    no answer is printed.
+    """
     from qrlsuite.training import trainer  # imports torch
 
+    unanswered = []
     alike: dict[str, list[Entry]] = {}
     for entry in entries:
         alike.setdefault(entry.population_key, []).append(entry)
@@ -134,7 +139,10 @@ def require_trainable(entries: Sequence[Entry], where: Where) -> None:
             if where.remote:
                 continue
             raise
-        trainer.require_trainable(population)
+        unanswered.append(trainer.require_trainable(population))
+    console = Console(stderr=True, quiet=quiet, highlight=False)
+    for note in dict.fromkeys(filter(None, unanswered)):
+        console.print(f"note: {printable(note)}", markup=False, emoji=False, soft_wrap=True)
 
 
 class _TimeIsUp(Exception):

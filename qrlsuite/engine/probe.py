@@ -239,7 +239,14 @@ class Probe:
         """Train the missing sides in fresh processes, and compare; return the value of `probe` in `run.json`."""
         self._made = True
         began = time.monotonic()
-        facts = {"seed": self.seed, "device": self.device.partition(":")[0], "code": code_of(self.entry)}
+        facts: dict[str, Any] = {
+            "seed": self.seed,
+            "device": self.device.partition(":")[0],
+            "code": code_of(self.entry),
+        }
+        parts = [each for each in self.entry.registered().values() if each.distribution != identity.OURS]
+        if declared := [each.spec.declared for each in parts if each.spec.declared]:
+            facts["declared"] = declared
 
         def found(result: str, **more: Any) -> ProbeRecord:
             return ProbeRecord.model_validate({**facts, "result": result, **more})

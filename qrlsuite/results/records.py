@@ -227,6 +227,7 @@ class ProbeRecord(Record):
 
     `seed` was trained alone for some `epochs`, on a kind of `device`, by a `code` with this digest. `difference` names
     the first value that differed, `reason` why nothing was probed. `seconds` are by the clock, `cpu` of processor time.
+    `declared` is what all seeds have in common by declaration of the plugins.
     """
 
     result: Literal["equal", "differs", "not probed"]
@@ -236,6 +237,7 @@ class ProbeRecord(Record):
     epochs: int | None = None
     difference: str | None = None
     reason: str | None = None
+    declared: list[Line] = []
     seconds: float | None = None
     cpu: float | None = None
 

@@ -248,7 +248,7 @@ def train_missing(
         As for `qrlsuite.engine.missing.train`; several entries, looks and studies share one.
     """
     lacking = sorted((work for work in works if work.groups), key=lambda work: work.left)
-    require_trainable([work.entry for work in lacking], where)
+    require_trainable([work.entry for work in lacking], where, quiet)
     limit, submitted = seconds(budget, where.workers), []
     for number, planned in enumerate(lacking, start=1):
         if limit is not None and time.monotonic() - began >= limit:

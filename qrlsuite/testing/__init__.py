@@ -42,8 +42,7 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
     settings:
         Values of options; others take their defaults (and circuit models two qubits and one layer).
     more:
-        For an environment: `deterministic=True` if all its episodes are meant to be equal. For an algorithm or model:
-        `task`, a task or its file, whose environment replaces the toys.
+        For an algorithm or model: `task`, a task or its file, whose environment replaces the toys.
     """
     import importlib
 

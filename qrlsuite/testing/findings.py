@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 
+from qrlsuite.errors import PluginError
+
 SIZES: tuple[tuple[int, ...], ...] = ((0,), (3,), (1, 2), (4, 1, 3), (3, 0, 4, 2, 1))
 """Groups in which an agent of 0..4 is compared with itself among all five: alone, in pairs, shuffled."""
 
@@ -75,14 +77,14 @@ class Checklist:
         looked_at:
             What a passing check has established.
         check:
-            Raises `BrokenRuleError` where the rule is broken. Any other exception breaks it too.
+            Raises `BrokenRuleError` or `PluginError` where the rule is broken. Any other exception breaks it too.
         cause:
             The likely cause of another exception.
         """
         _watcher.get()(rule)
         try:
             check()
-        except BrokenRuleError as error:
+        except (BrokenRuleError, PluginError) as error:
             self.findings.append(Finding(rule, False, str(error)))
         except Exception as error:  # whatever a stranger's code raises is the stranger's to read
             hint = f"; {cause}" if cause else ""

@@ -16,13 +16,12 @@ from torch import Tensor, nn
 
 from qrlsuite import population as populations
 from qrlsuite import specs
-from qrlsuite.errors import PluginError
 from qrlsuite.testing.common import Subject
-from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, one_thread, require
+from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
 from qrlsuite.testing.fresh import built_in_order
 from qrlsuite.testing.group import World
-from qrlsuite.training import unregistered
-from qrlsuite.training.fences import moved, seeded, states
+from qrlsuite.training import questions, unregistered
+from qrlsuite.training.fences import seeded
 from qrlsuite.training.trainer import build_agent, observed_space
 
 OUT, B, S = 3, 6, 5
@@ -233,15 +232,12 @@ def _registered(subjects: Subjects) -> None:
 
 
 def _unregistered(subjects: Subjects) -> None:
-    try:
-        unregistered.require_none(
-            subjects.agent,
-            subjects.inputs + subjects.remembered,
-            subjects.spec.name,
-            subjects.spec.population is None,
-        )
-    except PluginError as error:
-        raise BrokenRuleError(str(error)) from None
+    unregistered.require_none(
+        subjects.agent,
+        subjects.inputs + subjects.remembered,
+        subjects.spec.name,
+        subjects.spec.population is None,
+    )
 
 
 def _quantum(subjects: Subjects) -> None:
@@ -288,10 +284,7 @@ def _same(subjects: Subjects) -> None:
 
 
 def _different(subjects: Subjects) -> None:
-    require(
-        _equal(_values(subjects.agent(7)), _values(subjects.agent(8))) is not None,
-        f"generators of different seeds give the same parameters: {_DRAW}",
-    )
+    questions.require_own_weights(subjects.agent, subjects.spec)
     generator, built = torch.Generator().manual_seed(7), []
     for call in range(2):
         with seeded(call):
@@ -315,16 +308,7 @@ def _order(subject: Subject, subjects: Subjects) -> None:
 
 
 def _global(subjects: Subjects) -> None:
-    agent = subjects.agent(0)
-    before = states()
-    agent(subjects.x())
-    names = moved(before)
-    require(
-        not names,
-        f"a pass: it moved {' and '.join(names)}, which all seeds of a process share, so that no seed would be what it "
-        "is alone; draw from the generator or the streams that are handed to the plugin; leave out layers that draw, "
-        "such as Dropout",
-    )
+    questions.require_no_global_draw(subjects.agent(0), subjects.x(), subjects.spec)
 
 
 def _require_close(values: Tensor, others: Tensor, message: str) -> None:

@@ -11,34 +11,29 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.seeding import pack, unpack
 from qrlsuite.testing.findings import SIZES, BrokenRuleError, require
 from qrlsuite.testing.lanes import LONGEST, E, Lanes, S, actions, differs, first_episodes, play, rows
-
-_STREAMS = (
-    "draw from self.np_random in a gymnasium.Env, from self.streams in lanes, and from nothing global; set all state "
-    "in reset()"
-)
+from qrlsuite.training import questions
+from qrlsuite.training.questions import STREAMS
 
 
 def same_seed(lanes: Lanes, steps: int) -> None:
     """The same streams and actions give the same bits, in new and in used lanes."""
-    first, second = (lanes.make([0, 1]) for _ in range(2))
+    questions.require_reproducible(lanes.make, lanes.spec)
+    first = lanes.make([0, 1])
     action_rows = actions([0, 1], first.single_action_space, steps)
-    name = differs(play(first, action_rows), play(second, action_rows))
-    require(name is None, f"the same streams and actions give other {name}: {_STREAMS}")
+    play(first, action_rows)
     first.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
     again = lanes.make([0, 1])
     again.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
     name = differs(play(first, action_rows), play(again, action_rows))
-    require(name is None, f"a used environment, reset, shows other {name} than a new one: {_STREAMS}")
+    require(name is None, f"a used environment, reset, shows other {name} than a new one: {STREAMS}")
 
 
-def different_seed(lanes: Lanes, steps: int) -> None:
+def different_seed(lanes: Lanes) -> None:
     """Other streams give other episodes."""
-    envs, others = lanes.make([0]), lanes.make([5])
-    action_rows = actions([0], envs.single_action_space, steps)
     require(
-        differs(play(envs, action_rows), play(others, action_rows)) is not None,
-        f"other streams give the same {steps} steps: {_STREAMS}; if all episodes are meant to be alike, check with "
-        "--deterministic (in Python deterministic=True)",
+        questions.drawn(lanes.make, lanes.spec) != "alike",
+        f"all episodes are alike, whatever the stream: {STREAMS}; if that is meant, write repeats = True in the "
+        "EnvironmentSpec, or in the class of a file",
     )
 
 
@@ -53,7 +48,7 @@ def seed_independence(lanes: Lanes, steps: int) -> None:
         require(
             name is None,
             f"seeds {list(members)} among themselves see other {name} than among all {S}: a lane may depend on its own "
-            f"stream and actions alone; {_STREAMS}",
+            f"stream and actions alone; {STREAMS}",
         )
 
 

@@ -34,7 +34,7 @@ from qrlsuite.gymlanes import GymLanes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.progress import Progress
 from qrlsuite.seeding import Streams, pack, stream_key, unpack
-from qrlsuite.training import unregistered
+from qrlsuite.training import questions, unregistered
 from qrlsuite.training.device import find as find_device
 from qrlsuite.training.fences import seeded
 from qrlsuite.training.metering import MeteredEnv
@@ -105,25 +105,56 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
     )
 
 
-def require_trainable(entries: Sequence[Entry]) -> None:
+def require_trainable(entries: Sequence[Entry]) -> str:
     """Refuse an algorithm, a model and a task that do not fit; agents are built for it and not trained.
 
-    A third party's model that hides state from torch is refused, too (`qrlsuite.training.unregistered`).
+    A third party's model that hides state from torch is refused, too (`qrlsuite.training.unregistered`), and one whose
+    seeds share their weights, or an environment whose seeds share their episodes (`qrlsuite.training.questions`).
 
     Parameters
     ----------
     entries:
         One or more that one population can train.
+
+    Returns
+    -------
+    str
+        Why the environment gave no answer; empty where it did.
     """
     entry = entries[0]
     if entry.model.name == specs.NO_MODEL:
         require_actions(entry, build_envs(entry, 1, lambda: None).single_action_space)
-        return
+        return _require_own_episodes(entry)
     act = getattr(specs.resolve(entry.algorithm.factory), "act", len)
     if population.remembers(first_network(entry)) and not asks_for_more(act):
         raise _forgets(entry)
     if entry.third_party():
         Trainer(entries[:2], [0] * len(entries[:2]), checked=True)
+    return _require_own_episodes(entry)
+
+
+def _require_own_episodes(entry: Entry) -> str:
+    """Refuse a third party's environment whose seeds share their episodes; return why it gave no answer."""
+    spec = entry.task.environment
+    if entry.registered()["environment"].distribution == "qrlsuite":
+        return ""
+
+    def make(seeds: Sequence[int]) -> LaneEnv:
+        envs = build_envs(entry, 2 * len(seeds), lambda: None).inner
+        streams = [Streams(entry.task.hash, seed) for seed in seeds]
+        envs.seed_lanes([each.numpy("environment", lane) for each in streams for lane in range(2)])
+        return envs
+
+    unanswered = f"{spec.title} was not asked whether each seed meets its own episodes: "
+    try:
+        questions.require_reproducible(make, spec)
+        if not spec.repeats and questions.drawn(make, spec) == "unknown":
+            return f"{unanswered}that takes more than {questions.SECONDS:g} s of processor time"
+    except PluginError:
+        raise
+    except Exception as error:  # which training may meet, too, and report
+        return f"{unanswered}{own.failure(error)}"
+    return ""
 
 
 def _no_network(entry: Entry) -> OptionError:
@@ -308,7 +339,7 @@ class ModelBuilder:
 
     With `statistics`, all of them standardize their observations by these. While an agent is built, the global
     generators have states of its own stream, so that layers of torch may be built as they are. With `checked`, a model
-    that hides state from torch is refused (PluginError).
+    that hides state from torch, or begins alike in all seeds, is refused (PluginError).
     """
 
     def __init__(
@@ -345,13 +376,14 @@ class ModelBuilder:
                     return build_agent(build, given, outputs, chosen, generator, self.space, role)
 
             if self.checked:
-                first = self.streams[0]
-                two = first, Streams(first.task_hash, first.seed + 1)
+                seeds = [Streams(self.streams[0].task_hash, seed) for seed in range(questions.SEEDS)]
                 stacked = spec.population is None  # a stack keeps one agent's plain attributes for all
                 both = options[0], options[-1 if stacked else 0]
                 unregistered.require_none(
-                    lambda which: agent(two[which], both[which]), given, spec.name, stacked, outputs
+                    lambda which: agent(seeds[which], both[which]), given, spec.name, stacked, outputs
                 )
+                questions.require_own_weights(lambda seed: agent(seeds[seed], options[0]), spec)
+                questions.require_no_global_draw(agent(seeds[0], options[0]), torch.zeros(2, given), spec)
             agents = [agent(streams, chosen) for streams, chosen in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))

@@ -116,7 +116,7 @@ def _run(
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
         missing.settle_codes(runs / FOLDER, entries, where, display.console.quiet)
-        missing.require_trainable(entries, where)
+        missing.require_trainable(entries, where, display.console.quiet)
         works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
         for work in works:
             missing.prepare(work)

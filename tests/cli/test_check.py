@@ -136,12 +136,11 @@ def test_an_environment_is_checked_as_a_task_has_it(
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(testing, "check", lambda *words, **more: [asked.append((*words, more))][1:])
     given = load(tiny_task).file.environment.options
-    assert check("environment:beam6g", "--task", tiny_task, "degree=5", "--deterministic")[0] == 0
-    assert asked == [("environment", "beam6g", {**given, "degree": 5}, {"deterministic": True})]
+    assert check("environment:beam6g", "--task", tiny_task, "degree=5")[0] == 0
+    assert asked == [("environment", "beam6g", {**given, "degree": 5}, {})]
     assert (
         "its environment is 'beam6g', not 'cartpole'" in check("environment:cartpole", "--task", tiny_task)[2]
     )
-    assert "--deterministic is for an environment" in check("mlp", "--deterministic")[2]
     asked.clear()
     for word in ("algorithm:ddqn", "mlp"):
         assert check(word, "--task", tiny_task)[0] == 0

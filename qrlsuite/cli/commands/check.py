@@ -40,10 +40,6 @@ def check(
             help="Take the options of this task, or task file, for an environment, and its environment for others.",
         ),
     ] = None,
-    deterministic: Annotated[
-        bool,
-        typer.Option("--deterministic", help="All episodes of this environment are meant to be equal."),
-    ] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Test plugins against the suite's rules; a broken rule is shown with its likely cause.
@@ -56,10 +52,8 @@ def check(
         _teach(json_output)
         return
     items = selection.select(name)
-    more: dict[str, Any] = {"deterministic": True} if deterministic else {}
+    more: dict[str, Any] = {}
     kinds = [item.kind for item in items]
-    if deterministic and kinds != [specs.EnvironmentSpec]:
-        raise typer.BadParameter("--deterministic is for an environment: qrlsuite check environment:NAME")
     if task and kinds not in ([specs.EnvironmentSpec], [specs.AlgorithmSpec], [specs.ModelSpec]):
         raise typer.BadParameter(
             "--task is for one environment, algorithm or model: qrlsuite check KIND:NAME --task TASK"
