@@ -405,7 +405,7 @@ def read_entry(store: EntryStore) -> EntryResults | None:
     for probe in probes.of_records(run.record for run in runs):
         if probe.result == probes.DIFFERS:
             raise StoreError(
-                f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.seed} "
+                f"{store.path}: not ranked, for its seeds are not independent: trained again, seed {probe.seed} "
                 f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
             )
     asked = requests.read(store)

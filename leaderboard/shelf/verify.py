@@ -27,7 +27,6 @@ from qrlsuite.leaderboard.shelf.fingerprint import CHUNK, fingerprint
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results import provenance, speed
 from qrlsuite.results.progress import Progress
-from qrlsuite.results.records import Provenance
 from qrlsuite.results.store import learning_curve
 from qrlsuite.results.text import hours_text
 
@@ -424,45 +423,10 @@ def _same_parameters(stated: Mapping[str, int], counted: Mapping[str, int]) -> b
 
 
 def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
-    """Name a difference between this machine and the machine that made the seeds; None if bits must be equal.
-
-    The suite's version does not count: its parts compute equal bits while their `numerics` are equal (1 if not
-    recorded). Earlier versions of the suite recorded neither versions of plugins nor the device: these versions are
-    then not compared, and the device was the CPU.
-    """
+    """Name a difference between this machine and the machine that made the seeds; None if bits must be equal."""
     here = provenance.of(made_by)
-    for there in (origin for place in places for origin in entry.provenance[place].with_earlier):
-        if there.device.kind != "cpu":
-            return f"trained on the CPU here, on {there.device.kind} ({there.device.name or 'unknown'}) there"
-        for name, version in here.versions.items():
-            compared = name != "qrlsuite" and (name in there.versions or name in provenance.PACKAGES)
-            if there.versions.get(name) != version and compared:
-                return f"{name} {version} here, {there.versions.get(name)} there"
-        for role, number in here.numerics.items():
-            if there.numerics.get(role, 1) != number:
-                return f"numerics {number} of the {role} here, {there.numerics.get(role, 1)} there"
-        if there.system != here.system:
-            return f"system {here.system} here, {there.system} there"
-        if there.python != here.python:
-            return f"python {here.python} here, {there.python} there"
-        if differs := _other_instructions(here, there):
-            return differs
-    return None
-
-
-def _other_instructions(here: Provenance, there: Provenance) -> str | None:
-    """Name the difference between instruction sets of processors, unless both sides fixed them alike.
-
-    Older records have no `instructions`; nothing fixed them then.
-    """
-    fixed = here.instructions
-    if fixed != there.instructions:
-        return (
-            f"instruction sets fixed here by {fixed or 'nothing'}, there by {there.instructions or 'nothing'}"
-        )
-    if fixed.keys() == provenance.INSTRUCTIONS.keys() or there.processor == here.processor:
-        return None
-    return f"processor {here.processor} here, {there.processor} there"
+    origins = (origin for place in places for origin in entry.provenance[place].with_earlier)
+    return next((differs for there in origins if (differs := provenance.difference(here, there))), None)
 
 
 def _differs(entry: PublishedEntry, place: int, again: NDArray[np.float64]) -> str:

@@ -35,6 +35,7 @@ PHASES = {
     "starting": "starting",
     "compiling": "compiling circuits: once per machine",
     "probing": "probing",
+    "comparing": "comparing a seed with its record",
 }
 """Texts for a group's phases before its first epoch, which are no part of an epoch's time."""
 

@@ -10,6 +10,9 @@ suite's tests and are not probed.
 - A group that begins is one side itself, and its middle seed, alone, the other. A group of one is the other side, and
   three seeds are trained in a fresh process. Of a group of two, or one that goes on from a checkpoint, both sides are
   trained in fresh processes.
+- The fresh process then trains another seed, and the same again: variables of a class or module that grow show there.
+- Where a code was probed before, the first epoch of that seed is trained again, and must be its record: anything that
+  has changed in between shows there. On another machine, or with other versions, bits differ, and nothing is compared.
 - A probe is made once per code and kind of device, by the holder of its claim; its result is in `run.json` of the seeds
   that existed. Seeds that depend on their company are trained no further and never ranked.
 
@@ -25,7 +28,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,16 +40,20 @@ from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import TUNING_SEEDS
-from qrlsuite.results import probes
+from qrlsuite.results import probes, provenance
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
-from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord
-from qrlsuite.results.store import EntryStore, read_arrays
+from qrlsuite.results.progress import Progress
+from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord, Provenance
+from qrlsuite.results.store import EntryStore, SeedStore, read_arrays
 
 if TYPE_CHECKING:
     from qrlsuite.training.group import Part
     from qrlsuite.training.trainer import Trainer
+
+SECONDS = 10.0
+"""Of processor time, beyond which a seed is not trained once more."""
 
 MOST_EPOCHS = 10
 """After which a probe ends although no parameter has changed; it then shows nothing."""
@@ -61,11 +68,15 @@ def code_of(entry: Entry) -> str:
 
 @dataclass
 class Side:
-    """What a training gave for one seed, up to the epoch after which its parameters had changed."""
+    """What a training gave for one seed, up to the epoch after which its parameters had changed.
+
+    `again` is the first difference when it was trained once more after another seed, None where it was not.
+    """
 
     lines: list[Mapping[str, Any]]
     arrays: Arrays
     changed: bool = False
+    again: str | None = None
 
 
 def pack(header: Mapping[str, Any], arrays: Arrays) -> bytes:
@@ -135,8 +146,17 @@ def difference(together: Side, alone: Side) -> str:
     return f"the state '{name}' after epoch {len(together.lines)}" if name else ""
 
 
+class _TooLongError(BaseException):
+    """Training has used up its processor time. No code of a plugin catches it."""
+
+
 def train(
-    entry: Entry, seeds: Sequence[int], epochs: int, device: str = "cpu", start: Path | None = None
+    entry: Entry,
+    seeds: Sequence[int],
+    epochs: int,
+    device: str = "cpu",
+    start: Path | None = None,
+    limit: float | None = None,
 ) -> Side:
     """Train seeds from nothing until the parameters of the middle one have changed, for some epochs at most.
 
@@ -144,11 +164,19 @@ def train(
     ----------
     start:
         The file of the agent with which all of them begin, where the entry begins with agents.
+    limit:
+        Seconds of processor time after which it ends with `_TooLongError`.
     """
     from qrlsuite.training.group import lines_of
     from qrlsuite.training.trainer import Trainer
 
-    trainer = Trainer(entry, seeds, device)
+    began = time.process_time()
+
+    def tick(progress: Progress) -> None:
+        if limit is not None and time.process_time() - began > limit:
+            raise _TooLongError
+
+    trainer = Trainer(entry, seeds, device, tick)
     first = {} if start is None else read_arrays(start)
     trainer.start({name: np.stack([value] * len(seeds)) for name, value in first.items()})
     recorder = Recorder(trainer)
@@ -159,20 +187,39 @@ def train(
     return recorder.side
 
 
+def _again(side: Side, took: float, entry: Entry, seeds: Sequence[int], *more: Any) -> str | None:
+    """Train another block's seed, and then the same seeds once more; return the first difference from a side.
+
+    None if that would take too long, as by the processor time of the first training.
+    """
+    if 2 * took > SECONDS:
+        return None
+    train(entry, [seeds[0] + TUNING_SEEDS], 1, *more)
+    return difference(side, train(entry, seeds, len(side.lines), *more))
+
+
 class _ProbeFailed(Exception):
     """The fresh process ended without an answer, for a reason that says nothing about seeds."""
 
 
 def in_fresh_process(
-    entry: Entry, seeds: Sequence[int], epochs: int, device: str, start: Path | None = None
+    entry: Entry,
+    seeds: Sequence[int],
+    epochs: int,
+    device: str,
+    start: Path | None = None,
+    again: bool = False,
+    limit: float | None = None,
 ) -> tuple[Side, float]:
-    """Run `train` in a process that has run nothing else; return its processor time, too."""
+    """Run `train` in a process that has run nothing else, then once more if `again`; return its processor time, too."""
     task: dict[str, Any] = {
         "entry": EntryRecord.of(entry).content,
         "seeds": list(seeds),
         "epochs": epochs,
         "device": device,
         "start": start and str(start),
+        "again": again,
+        "limit": limit,
     }
     task["plugins"] = [str(plugin.copy) for plugin in identity.plugins(entry)]
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
@@ -196,7 +243,7 @@ def in_fresh_process(
         header, arrays = unpack(answer.read_bytes())
     if header["error"] is not None:
         raise PluginError(header["error"])
-    return Side(header["lines"], arrays, header["changed"]), header["cpu"]
+    return Side(header["lines"], arrays, header["changed"], header["again"]), header["cpu"]
 
 
 class Probe:
@@ -210,23 +257,65 @@ class Probe:
         With which this process keeps others from making it, too.
     start:
         The file of the agent with which the seed begins, where the entry begins with agents.
+    recorded:
+        The seed's folder, if it was trained before.
+    made:
+        Whether the code was probed before.
     """
 
     def __init__(
-        self, entry: Entry, seed: int, epochs: int, device: str, claim: Claim, start: Path | None = None
+        self,
+        entry: Entry,
+        seed: int,
+        epochs: int,
+        device: str,
+        claim: Claim,
+        start: Path | None = None,
+        recorded: SeedStore | None = None,
+        made: bool = False,
     ) -> None:
-        self.start = start
+        self.start, self.recorded = start, recorded
         self.entry, self.seed, self.device, self.claim = entry, seed, device, claim
         self.epochs = min(epochs, MOST_EPOCHS)
         self._recorder: Recorder | None = None
         self._alone = False
-        self._made = False
+        self._made = made
+
+    def require_unchanged(self, trainer: Trainer) -> str:
+        """Refuse to train on where the seed's first epoch is not its record; return why they were not compared."""
+        record = None if self.recorded is None else self.recorded.record()
+        lines = [] if self.recorded is None or record is None else self.recorded.epochs()
+        if record is None or not lines:
+            return ""
+        here, skipped = (
+            provenance.of(self.entry, trainer.device),
+            f"seed {self.seed} was not compared with its record: ",
+        )
+        there = record.provenance[0] if record.provenance else Provenance()
+        if elsewhere := provenance.difference(here, there):
+            return f"{skipped}{elsewhere}"
+        try:
+            side, _ = in_fresh_process(self.entry, [self.seed], 1, self.device, self.start, limit=SECONDS)
+            found = difference(Side([lines[0].content], {}), replace(side, arrays={}))
+        except _ProbeFailed as error:
+            return f"{skipped}{error}"
+        except PluginError as error:
+            found = f"that it fails: {error}"
+        if found:
+            raise probes.DependentSeedsError(
+                f"seed {self.seed} is not what it was: trained again in a fresh process, it differs from its record "
+                f"({self.recorded.path}) in {found}. Something has changed since: the code, if --same joined two; a "
+                "file that the plugin reads and does not declare, another package, a variable of the environment. "
+                "Nothing was trained, and nothing is lost: restore it and repeat the command, or begin anew with "
+                "--runs DIR"
+            )
+        return ""
 
     def begin(self, trainer: Trainer) -> bool:
         """Look at a training before its first epoch; returns whether `judge` can be called."""
         if trainer.epoch == 0 and trainer.S != 2:
             self._recorder, self._alone = Recorder(trainer), trainer.S == 1
-        return self._recorder is None
+        return self._recorder is None and not self._made
 
     def add(self, trainer: Trainer, lines: Sequence[EpochLine], state: Arrays) -> bool:
         """Add an epoch; returns whether `judge` can be called."""
@@ -252,39 +341,51 @@ class Probe:
             return ProbeRecord.model_validate({**facts, "result": result, **more})
 
         try:
-            epochs, changed, what, cpu = self._compare()
+            together, again, what, cpu = self._compare()
         except _ProbeFailed as error:
             return found(NOT_PROBED, reason=str(error))
-        cost = {"seconds": round(time.monotonic() - began, 2), "cpu": round(cpu, 2)}
+        epochs = len(together.lines)
+        cost: dict[str, Any] = {"seconds": round(time.monotonic() - began, 2), "cpu": round(cpu, 2)}
         if what:
             return found(DIFFERS, epochs=epochs, difference=what, **cost)
-        if not changed:
+        if not together.changed:
             reason = f"no parameter has changed within {epochs} epochs"
             return found(NOT_PROBED, reason=reason, **cost)
+        if not again:
+            cost["reason"] = (
+                f"not once more after another seed, for more than {SECONDS:g} s of processor time"
+            )
         return found(EQUAL, epochs=epochs, **cost)
 
-    def _compare(self) -> tuple[int, bool, str, float]:
-        """Return the compared epochs, whether parameters changed, the first difference, and the processor time."""
+    def _compare(self) -> tuple[Side, bool, str, float]:
+        """Return the side in company, whether one was trained again, the first difference, and the processor time."""
         seed, cpu = self.seed, 0.0
         sides = []
         for seeds in ([abs(seed - 1), seed, seed + 1 + (seed == 0)], [seed]):
             if self._recorder is not None and (seeds == [seed]) == self._alone:
                 sides.append(self._recorder.side)  # the group itself
                 continue
+            again = seeds == [seed] or self._alone
             try:
-                side, seconds = in_fresh_process(self.entry, seeds, self.epochs, self.device, self.start)
+                side, seconds = in_fresh_process(
+                    self.entry, seeds, self.epochs, self.device, self.start, again
+                )
             except PluginError as error:
                 if self._recorder is None and not sides:  # it fails in company, too
                     raise _ProbeFailed(str(error)) from error
-                return 0, False, f"that it fails: {error}", cpu
+                return Side([], {}), False, f"that it fails: {error}", cpu
             sides.append(side)
             cpu += seconds
         together, alone = sides
-        return len(together.lines), together.changed, difference(together, alone), cpu
+        again = together.again if self._alone else alone.again
+        found = difference(together, alone) or (f"{again}, after another seed" if again else "")
+        return together, again is not None, found, cpu
 
 
 def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
     """Return the probe that a group is to make; None where none is needed, or another process makes it.
+
+    Where an equal code was probed, it only compares that seed with its record.
 
     Seeds for tuning are not probed: nothing ranks them.
 
@@ -298,14 +399,15 @@ def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
     if not entry.third_party() or seed >= TUNING_SEEDS:
         return None
     key = EQUAL, device.partition(":")[0], code_of(entry)
-    if any((probe.result, probe.device, probe.code) == key for probe in probes.of_entry(store)):
-        return None
+    made = [each for each in probes.of_entry(store) if (each.result, each.device, each.code) == key]
+    seed = next((each.seed for each in made if each.seed is not None), seed)
     try:
         claim = acquire(EntryStore(store.path / _FOLDER), [0])
     except SeedsClaimedError:
         return None
     start = None if entry.start is None else store.start_of(seed).absolute()
-    return Probe(entry, seed, epochs, device, claim, start)
+    recorded = store.seed(seed) if seed in store.seeds() else None
+    return Probe(entry, seed, epochs, device, claim, start, recorded, bool(made))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -323,9 +425,15 @@ def main(arguments: Sequence[str]) -> int:
             own.load(path)
         start = None if task["start"] is None else Path(task["start"])
         entry = EntryRecord.read(task["entry"], "the probe").entry("the probe")
-        side = train(entry, task["seeds"], task["epochs"], task["device"], start)
-        header |= {"lines": side.lines, "changed": side.changed}
+        began, more = time.process_time(), (task["device"], start, task["limit"])
+        side = train(entry, task["seeds"], task["epochs"], *more)
+        took = time.process_time() - began
+        again = _again(side, took, entry, task["seeds"], *more) if task["again"] else None
+        header |= {"lines": side.lines, "changed": side.changed, "again": again}
         arrays = side.arrays
+    except _TooLongError:
+        print(f"an epoch takes more than {task['limit']:g} s of processor time")
+        return 2
     except (PluginError, EnvironmentFailure) as error:
         header["error"] = str(error)
     except QrlSuiteError as error:  # there is no such device here, say

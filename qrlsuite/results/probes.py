@@ -16,7 +16,7 @@ EQUAL, DIFFERS, NOT_PROBED = "equal", "differs", "not probed"
 
 
 class DependentSeedsError(PluginError):
-    """A seed gives another result in company than alone."""
+    """A seed gives another result in company than alone, or than it gave."""
 
 
 def of_records(records: Iterable[RunRecord | None]) -> list[ProbeRecord]:
@@ -41,7 +41,7 @@ def sentence(probe: ProbeRecord) -> str:
         return f"not probed: {probe.reason}"
     return (
         f"probed: seed {probe.seed} is the same alone, to the last bit, up to epoch {probe.epochs} "
-        f"({probe.seconds} s, {probe.cpu} s of processor time)"
+        f"({probe.seconds} s, {probe.cpu} s of processor time)" + f"; {probe.reason}" * bool(probe.reason)
     )
 
 
@@ -69,8 +69,8 @@ def refusal(store: EntryStore, probe: ProbeRecord) -> DependentSeedsError:
     loaded = own.of_distribution(registered[name].distribution) if name in registered else None
     plugin = f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None else ""
     return DependentSeedsError(
-        f"seed {probe.seed} depends on its company: trained alone in a fresh process, it differs from the same seed "
-        f"in a group in {probe.difference}. So no seed is what it says, and boards leave the entry out. Likely "
+        f"seed {probe.seed} depends on its company: trained again in a fresh process, it differs in "
+        f"{probe.difference}. So no seed is what it says, and boards leave the entry out. Likely "
         "causes: something that all agents of a process share (a global variable, a class attribute, a closure, a "
         "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
         "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "

@@ -79,7 +79,7 @@ class ProgressFile:
         """
         now = time.monotonic()
         silent = progress.phase == "training" and 0 < progress.total <= progress.done
-        silent |= progress.phase in ("compiling", "probing")
+        silent |= progress.phase in ("compiling", "comparing", "probing")
         if not (force or silent) and now - self._written < 0.5:
             return
         self._written = now

@@ -78,6 +78,41 @@ def version(distribution: str) -> str | None:
         return None
 
 
+def difference(here: Provenance, there: Provenance) -> str | None:
+    """Name a difference on which bits may depend; None if they must be equal.
+
+    The suite's version does not count: its parts compute equal bits while their `numerics` are equal (1 if not
+    recorded). Earlier versions of the suite recorded neither versions of plugins nor the device: these versions are
+    then not compared, and the device was the CPU.
+    """
+    devices = [
+        "the CPU" if each.kind == "cpu" else f"{each.kind} ({each.name or 'unknown'})"
+        for each in (here.device, there.device)
+    ]
+    if devices[0] != devices[1]:
+        return f"trained on {devices[0]} here, on {devices[1]} there"
+    for name, number in here.versions.items():
+        compared = name != "qrlsuite" and (name in there.versions or name in PACKAGES)
+        if there.versions.get(name) != number and compared:
+            return f"{name} {number} here, {there.versions.get(name)} there"
+    for role, counted in here.numerics.items():
+        if there.numerics.get(role, 1) != counted:
+            return f"numerics {counted} of the {role} here, {there.numerics.get(role, 1)} there"
+    if there.system != here.system:
+        return f"system {here.system} here, {there.system} there"
+    if there.python != here.python:
+        return f"python {here.python} here, {there.python} there"
+    # older records have no `instructions`; nothing fixed them then
+    fixed = here.instructions
+    if fixed != there.instructions:
+        return (
+            f"instruction sets fixed here by {fixed or 'nothing'}, there by {there.instructions or 'nothing'}"
+        )
+    if fixed.keys() == INSTRUCTIONS.keys() or there.processor == here.processor:
+        return None
+    return f"processor {here.processor} here, {there.processor} there"
+
+
 def versions(origins: Iterable[Provenance]) -> dict[str, tuple[str, ...]]:
     """Return every version that occurs, by distribution; Python's under "python"."""
     by_package: dict[str, set[str]] = {}

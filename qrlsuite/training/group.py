@@ -40,6 +40,9 @@ CHECKPOINT_SECONDS = 60.0
 class GroupProbe(Protocol):
     """Shows, while a group is trained, that its middle seed does not depend on the others: `qrlsuite.engine.probe`."""
 
+    def require_unchanged(self, trainer: Trainer) -> str:
+        """Refuse to train beside seeds that would not become the same again; return why none was trained again."""
+
     def begin(self, trainer: Trainer) -> bool:
         """Look at a training before its first epoch; returns whether `judge` can be called."""
 
@@ -289,6 +292,8 @@ class GroupRun:
         """Train to the last epoch; on an interruption, save the last finished epoch and raise it again."""
         with Interruptible() as guard:
             try:
+                if self.probe is not None:
+                    self._compare(self.probe)
                 with guard.deferred():
                     self._begin()
                 if (
@@ -352,6 +357,13 @@ class GroupRun:
             self.progress.phase = "compiling"
             self.report(self.progress)
             self.trainer.models.compile_circuits()
+
+    def _compare(self, probe: GroupProbe) -> None:
+        """Compare an earlier seed with its record."""
+        self.progress.phase = "comparing"
+        self.report(self.progress)
+        if reason := probe.require_unchanged(self.trainer):
+            self.progress.warnings.append(reason)
 
     def _judge(self, guard: Interruptible, probe: GroupProbe) -> None:
         """Make the probe, and record its result; an interruption ends it, and the same command makes it again."""

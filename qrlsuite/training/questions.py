@@ -24,8 +24,8 @@ from qrlsuite.training.fences import moved, seeded, states
 
 SECONDS = 10.0
 """Of processor time, after which an environment is asked no further."""
-STEPS = 50
-"""In which lanes with equal streams are compared."""
+STEPS = 300
+"""In which lanes with equal streams are compared, and rare draws are waited for."""
 SEEDS, CHANGES = 8, 20
 """Seeds with equal weights, and equal changes from an episode to the next, that are no chance any more.
 
@@ -142,7 +142,7 @@ def require_reproducible(make: Make, spec: specs.EnvironmentSpec, limit: float =
     first, second = _Lanes(make, 0), _Lanes(make, 1)
     began = time.process_time()
     for _ in range(STEPS):
-        if time.process_time() - began > limit:
+        if time.process_time() - began > limit / 10:
             break
         first.step()
         second.step()
@@ -164,7 +164,7 @@ def drawn(
         processor time.
     """
     lanes, began = _Lanes(make, 0), time.process_time()
-    while True:
+    for taken in itertools.count():
         shown = lanes.shown()
         alike = [lane for lane, own in enumerate(shown) if shown.count(own) > 1]
         if not alike:
@@ -172,7 +172,7 @@ def drawn(
         changes = [lanes.changes(lane) for lane in alike]
         if max(changes) >= CHANGES:
             break
-        if max(changes) == 0 and all(len(lanes.episodes[lane]) > 1 for lane in alike):
+        if taken >= STEPS and max(changes) == 0 and all(len(lanes.episodes[lane]) > 1 for lane in alike):
             return "alike"
         if time.process_time() - began > limit:
             return "unknown"

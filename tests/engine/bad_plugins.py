@@ -54,6 +54,22 @@ def class_attribute(obs: int, out: int, options: Any, generator: torch.Generator
     return net
 
 
+class Growing(Net):
+    passes = 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        Growing.passes += 1
+        return super().forward(x) * (1 + Growing.passes / 1000)
+
+
+def growing(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
+    return Growing(obs, out, generator)
+
+
+def changing(obs: int, out: int, options: Any, generator: torch.Generator) -> nn.Module:
+    return scaled(Net(obs, out, generator), float(os.environ.get("GAIN", "1")))
+
+
 WEIGHTS: dict[str, Tensor] = {}
 
 

@@ -25,7 +25,7 @@ from qrlsuite import hookimpl, specs
 
 @hookimpl
 def register_models(register):
-    for name in ("good", "class_attribute", "waiting"):
+    for name in ("good", "class_attribute", "growing", "changing", "waiting"):
         register(specs.ModelSpec(name, "for tests", family="classical", options="bad_plugins:Options",
                                  build=f"{'acme_waiting' if name == 'waiting' else 'bad_plugins'}:{name}"))
 """
@@ -107,7 +107,10 @@ def test_one_seed_and_two_are_probed_among_three(acme: Acme) -> None:
 
 def test_dependent_seeds_end_the_run_and_are_not_ranked(acme: Acme) -> None:
     said = acme.run("class_attribute", "4", "--workers", "1", code=2)
-    assert "seed 2 depends on its company: trained alone in a fresh process, it differs" in said
+    assert (
+        "seed 2 depends on its company: trained again in a fresh process, it differs in 'loss' of epoch 1."
+        in said
+    )
     assert "qrlsuite check model:class_attribute" in said
     assert {record["result"] for record in acme.probes().values()} == {"differs"}
     kept = EntryStore(acme.entry()).seed(0).epochs()
@@ -119,9 +122,44 @@ def test_dependent_seeds_end_the_run_and_are_not_ranked(acme: Acme) -> None:
     assert EntryStore(acme.entry()).seed(0).epochs() == kept
 
     board = qrlsuite("leaderboard", "--runs", str(acme.folder / "runs"), env=acme.environment)
-    assert "not ranked, for its seeds are not independent: trained alone, seed 2 differs" in " ".join(
+    assert "not ranked, for its seeds are not independent: trained again, seed 2 differs" in " ".join(
         (board.stdout + board.stderr).split()
     )
+
+
+def test_a_variable_that_grows_ends_the_run(acme: Acme) -> None:
+    """Alone and in company it is the same, since a pass is one for all seeds."""
+    said = acme.run("growing", "2", code=2)
+    assert "it differs in 'loss' of epoch 1, after another seed. So no seed is what it says" in said
+    assert {record["result"] for record in acme.probes().values()} == {"differs"}
+
+
+@pytest.mark.parametrize("seeds", ["3", "5"], ids=["longer", "more"])
+def test_what_changed_since_is_seen_and_nothing_is_lost(seeds: str, acme: Acme) -> None:
+    """Not the code, but something that it uses."""
+    acme.run("changing", "3", runs="straight")
+    acme.run("changing", seeds, "--epochs", "4", runs="straight")
+    acme.run("changing", "3")
+    acme.environment["GAIN"] = "2"
+    said = acme.run("changing", seeds, "--epochs", "4", code=2)
+    assert "seed 1 is not what it was: trained again in a fresh process, it differs from its record" in said
+    assert re.search(r"in '\w+' of epoch 1\. Something has changed since", said)
+    assert len(list(acme.entry().glob("seed-*"))) == 3
+
+    del acme.environment["GAIN"]
+    acme.run("changing", seeds, "--epochs", "4")
+    for seed in range(int(seeds)):
+        assert results(acme.entry(), seed) == results(acme.entry("straight"), seed)
+
+
+def test_with_other_versions_nothing_is_compared_and_that_is_said(acme: Acme) -> None:
+    acme.run("changing", "1")
+    (path,) = acme.entry().glob("seed-*/run.json")
+    record = json.loads(path.read_text())
+    record["provenance"][0]["versions"]["torch"] = "1.0"
+    path.write_text(json.dumps(record))
+    said = acme.run("changing", "1", "--epochs", "4")
+    assert re.search(r"warning: seed 0 was not compared with its record: torch \S+ here, 1\.0 there", said)
 
 
 def test_corrected_code_begins_anew_beside_dependent_seeds(acme: Acme) -> None:
