@@ -283,9 +283,9 @@ class Probe:
 
     def require_unchanged(self, trainer: Trainer) -> str:
         """Refuse to train on where the seed's first epoch is not its record; return why they were not compared."""
-        record = None if self.recorded is None else self.recorded.record()
-        lines = [] if self.recorded is None or record is None else self.recorded.epochs()
-        if record is None or not lines:
+        if self.recorded is None or (record := self.recorded.record()) is None:
+            return ""
+        if not (lines := self.recorded.epochs()):
             return ""
         here, skipped = (
             provenance.of(self.entry, trainer.device),
@@ -377,9 +377,9 @@ class Probe:
             sides.append(side)
             cpu += seconds
         together, alone = sides
-        again = together.again if self._alone else alone.again
-        found = difference(together, alone) or (f"{again}, after another seed" if again else "")
-        return together, again is not None, found, cpu
+        more = together.again if self._alone else alone.again
+        found = difference(together, alone) or (f"{more}, after another seed" if more else "")
+        return together, more is not None, found, cpu
 
 
 def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
