@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from qrlsuite.columns import Column
 from qrlsuite.engine.sheet import Sheet
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.leaderboard.boards import columns
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.shelf.absent import absent
@@ -226,7 +227,10 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
     """Return the notes on entries that may turn a verdict: these stand first."""
     notes = {
         "curves that other programs made, and nobody here can train or check again": {
-            entry.label: "" for entry in entries if entry.external
+            entry.label: "" for entry in entries if entry.external and entry.algorithm != SCRIPT
+        },
+        "trained by scripts, which `qrlsuite verify` cannot train again": {
+            entry.label: "" for entry in entries if entry.algorithm == SCRIPT
         },
         "warm-started, without the steps that their first agents took before": {
             entry.label.partition(f" {START}=")[0]: f"from {entry.identity[START]}"

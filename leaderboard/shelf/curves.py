@@ -20,6 +20,7 @@ from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.identity import CodeIdentity
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance, requests
@@ -202,6 +203,11 @@ class EntryResults(Shown):
     def external(self) -> bool:
         """Whether another program made the curves: nobody here trained them, or can check them."""
         return bool(self.record.imported)
+
+    @property
+    def made(self) -> str:
+        """Who made external curves, in words."""
+        return "by a script, not repeatable here" if self.algorithm == SCRIPT else "by another program"
 
     @property
     def first_thresholds(self) -> tuple[float, ...] | None:
@@ -451,7 +457,7 @@ class EntryResults(Shown):
         return {
             "task": self.task,
             "entry": f"{self.label} ({self.name})",
-            **({"made": "by another program"} if self.external else {}),
+            **({"made": self.made} if self.external else {}),
             "parameters": self.parameters_text(" quantum"),
             "seeds": f"{n_runs}"
             + (f", {len(self.left_out)} unfinished left out" if self.left_out else "")

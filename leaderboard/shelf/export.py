@@ -14,10 +14,11 @@ import numpy as np
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.files import read_bytes
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
+from qrlsuite.leaderboard.shelf.fingerprint import fingerprint, unknown
 from qrlsuite.results import codes, probes, requests
 from qrlsuite.results.records import Provenance
 from qrlsuite.results.seeds import format_seeds
@@ -44,14 +45,16 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     if entry.source != "runs":
         raise QrlSuiteError(f"{entry.folder} is a published entry already")
     store = EntryStore(entry.folder)
-    built = store.entry()
+    record = store.record()
+    scripted = record.identity.algorithm == SCRIPT
+    built = record.entry(str(store.path)) if scripted else store.entry()
     if built.start is not None:
         raise QrlSuiteError(
             f"'{entry.label}' begins with the agents of another entry, so nobody could train its seeds again from what "
             "is published: it cannot be exported"
         )
-    codes.require_installed(store, identity.of(built))
-    record = store.record()
+    if not scripted:
+        codes.require_installed(store, identity.of(built))
     run = {name: value for name, value in record.content.items() if name not in ("published", "code")}
     folder = out / entry.task / built.name
     kept = _agents(store, entry) if agents else {}
@@ -88,7 +91,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
         [run.executions for run in runs],
         [_made_with(record.provenance) for record in records],
         {"classical": 0, "quantum": 0, **parameters_of(records)},
-        fingerprint(built, entry.seeds),
+        unknown(len(entry.seeds)) if scripted else fingerprint(built, entry.seeds),
         {**_found(runs), **({"withdrawn": withdrawn} if withdrawn else {})},
         kept,
         entry.metrics,

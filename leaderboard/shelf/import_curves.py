@@ -22,15 +22,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
-from qrlsuite import files, notation, registry, specs
+from qrlsuite import notation, registry, specs
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import FileError, OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import task as tasks
-from qrlsuite.experiment.entry import EXTERNAL
-from qrlsuite.experiment.task import TaskFile, digest
+from qrlsuite.experiment.task import EXTERNAL, Task, TaskFile, digest
 from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.import_seeds import Imported, unite
 from qrlsuite.options import parse_setting
@@ -66,8 +64,6 @@ EARLY = {
     "cut": "every run is to be cut to the shortest",
 }
 """Meanings of runs that end before the others of their entry."""
-_EPSILONS, _REFERENCE = [0.1, 0.2, 0.3, 0.4], 0.2
-_DELTAS, _DELTA = [0.5, 0.75], 0.5
 
 
 def import_points(
@@ -104,7 +100,7 @@ def import_points(
     if known is None:
         _require_reachable(curves, given, goal == "below")
         file = _new_task(name, step, curves, maximum, given, _score_of(goal, metric, maximum))
-        definition = _definition(file)
+        definition = Task(file, name).definition
     else:
         file, definition, name = known
         _require_same_options(file, maximum, given, every)
@@ -342,61 +338,12 @@ def _new_task(
     score: Mapping[str, Any],
 ) -> TaskFile:
     """Return the file of a task that these curves are the first of."""
-    if maximum is None and not thresholds:
-        raise OptionError(
-            f"'{printable(name)}' is a new task: say what a good score is with maximum=BEST (the best possible), "
-            "thresholds=A,B,... (scores that count as reached; with goal=below less is better), or --task TASK of the "
-            "suite"
-        )
-    hardest = 0 if score.get("goal") == "below" else -1
-    ranking: dict[str, Any] = {
-        "thresholds": thresholds,
-        "reference": {"threshold": (thresholds or [0])[hardest]},
-    }
-    if maximum is not None:
-        epsilons = [round(1 - level / maximum, 12) for level in reversed(thresholds)] or _EPSILONS
-        reference = _REFERENCE if not thresholds else epsilons[0]
-        ranking = {"epsilons": epsilons, "reference": {"epsilon": reference}}
     lengths: dict[str, list[int]] = defaultdict(list)
     for (entry, _), curve in curves.items():
         lengths[entry].append(len(curve))
     common = min(sorted(own, reverse=True)[(len(own) - 1) // 2] for own in lengths.values())
-    content = {
-        "format_version": 1,
-        "name": name,
-        "summary": "Learning curves that other programs made",
-        "environment": {"name": EXTERNAL},
-        "protocol": {
-            "seeds": MIN_RUNS,
-            "epochs": max(map(len, curves.values())),
-            "environments": 1,
-            "interactions": every,
-            "validation_episodes": 1,
-        },
-        "score": score,
-        "ranking": {
-            **ranking,
-            "reference": {**ranking["reference"], "delta": _DELTA},
-            "deltas": _DELTAS,
-            "horizons": [common * every],
-        },
-    }
-    try:
-        return TaskFile.model_validate(content)
-    except pydantic.ValidationError as error:
-        raise OptionError(f"--task {printable(name)}: {'; '.join(files.problems(error, TaskFile))}") from None
-
-
-def _definition(file: TaskFile) -> dict[str, Any]:
-    """Return the content of a new task's hash."""
-    return {
-        "environment": file.environment.name,
-        "environment_options": {},
-        "environments": file.protocol.environments,
-        "interactions": file.protocol.interactions,
-        "validation_episodes": file.protocol.validation_episodes,
-        "score": file.score.model_dump(mode="json"),
-    }
+    epochs = max(map(len, curves.values()))
+    return tasks.external(name, every, epochs, maximum, thresholds, score, common)
 
 
 def _require_same_options(

@@ -26,6 +26,7 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
@@ -106,7 +107,10 @@ def import_seeds(source: EntryStore, runs: Path, study: str | None = None) -> Im
         Hash of the study with looks that the results folder belongs to, if it does.
     """
     exported = published.read(source.path) if published.is_published(source.path) else None
-    entry = source.entry()  # computes the hash anew
+    record = (
+        source.record()
+    )  # what another program made is imported from its files; a script's seeds can go on here
+    entry = record.entry(str(source.path)) if record.identity.algorithm == SCRIPT else source.entry()
     if entry.study != study:
         raise StoreError(
             f"{source.path} belongs to a study with looks, whose number of seeds depends on what they showed: it is "

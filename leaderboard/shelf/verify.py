@@ -163,14 +163,16 @@ def verify(
     try:
         entry, digest = published.read(folder), _digest(folder)
         _check_agents(entry)
-        made_by = entry.record.entry(str(folder / "entry.json")) if rerun else None
+        repeatable = not entry.record.imported
+        made_by = entry.record.entry(str(folder / "entry.json")) if rerun and repeatable else None
     except QrlSuiteError as error:
         return VerificationResult(folder, name, False, "files", (), str(error))
     count, length = entry.curves.shape
     if made_by is None:
         agents = f", {len(entry.agents)} agents" if entry.agents else ""
         sound = f"files sound: {count} seeds of {length} epochs{agents}, hashes and label computed again"
-        message = "; ".join(filter(None, [sound, entry.chosen_seeds, "no seed was trained again"]))
+        again = "no seed was trained again" if repeatable else "not repeatable here: a script trained it"
+        message = "; ".join(filter(None, [sound, entry.chosen_seeds, again]))
         return VerificationResult(folder, name, True, "files", (), message, digest)
     if changed := _changed_code(entry, made_by):
         return VerificationResult(folder, name, False, "files", (), changed, digest)
@@ -188,7 +190,7 @@ def verify(
 def _check_agents(entry: PublishedEntry) -> None:
     """Check numbers of parameters; agents match the record and fit the model. What is not installed is not checked."""
     agents = entry.parameters()
-    if absent(entry.entry_results()):
+    if entry.record.imported or absent(entry.entry_results()):
         return
     from qrlsuite.training.evaluation import require_fitting  # torch, which checking files does without
     from qrlsuite.training.trainer import Trainer

@@ -91,8 +91,11 @@ class SlurmOptions:
 class ArrayTask:
     """What a task of the array does; submitit pickles it for its own job, by reference to this class."""
 
-    def __init__(self, folder: str, seeds: tuple[int, ...], epochs: int, device: str) -> None:
+    def __init__(
+        self, folder: str, seeds: tuple[int, ...], epochs: int, device: str, script: Sequence[str] = ()
+    ) -> None:
         self.folder, self.seeds, self.epochs, self.device = folder, seeds, epochs, device
+        self.script = script
         self._engine: LocalEngine | None = None
 
     def __call__(self) -> None:
@@ -100,7 +103,8 @@ class ArrayTask:
         signal.signal(signal.SIGTERM, _canceled)
         self._engine = LocalEngine()
         group = SeedGroup(self.seeds, 0)
-        work = Work(EntryStore(Path(self.folder)), [group], self.epochs, 1, self.device)
+        store = EntryStore(Path(self.folder))
+        work = Work(store, [group], self.epochs, 1, self.device, script=self.script)
         outcome = self._engine.run([work], lambda snapshot: None)
         raise_failures(outcome)
         for message in outcome.taken.values():
@@ -113,7 +117,7 @@ class ArrayTask:
         if self._engine is not None:
             self._engine.stop()
         return submitit.helpers.DelayedSubmission(
-            ArrayTask(self.folder, self.seeds, self.epochs, self.device)
+            ArrayTask(self.folder, self.seeds, self.epochs, self.device, self.script)
         )
 
 
@@ -170,9 +174,8 @@ class SlurmEngine:
             "job_name": f"qrlsuite-{work.store.path.name}",
             "additional_parameters": {"requeue": True},
         }
-        tasks = [
-            ArrayTask(str(work.store.path.absolute()), g.seeds, work.epochs, work.device) for g in work.groups
-        ]
+        path = str(work.store.path.absolute())
+        tasks = [ArrayTask(path, g.seeds, work.epochs, work.device, work.script) for g in work.groups]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             executor = submitit.SlurmExecutor(folder, max_num_timeout=REQUEUES)

@@ -92,6 +92,7 @@ def new_study(
         entries,
         Path(runs),
         first_seed=first_seed,
+        folder=file.parent,
         epochs=epochs,
         looks=list(looks),
         alpha=alpha,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -141,7 +142,8 @@ def resolve_entry(
         For an option or a file that cannot be used.
     """
     try:
-        return resolve(task, model, algorithm, settings, preset)
+        entry = resolve(task, model, algorithm, settings, preset)
+        return entry if entry.script is None else replace(entry, folder=Path.cwd())
     except UnknownNameError as error:
         raise UnknownNameError(f"{error}{plugins_in(Path(runs), str(error))}") from None
 
@@ -171,6 +173,12 @@ def train_entry(
         The missing seeds when it began; and one line about seeds handed to a queue, None if they were trained.
     """
     folder, quiet = Path(runs), not progress
+    if entry.script is not None:
+        if track or start is not None or where.device != "cpu":
+            raise OptionError(
+                f"'{entry.label}': trackers, --device and --from are the script's own affair: write them in its command"
+            )
+        entry = entry if epochs is None else entry.for_epochs(epochs)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     check_positive("epochs", epochs)
     put_agents = None

@@ -320,7 +320,10 @@ class RunDisplay:
         parts = [f"{counted(todo, 'seed')} to epoch {self.epochs}, {self.workers} {places}"]
         parts += [f"{counted(complete, 'seed')} already there"] if complete else []
         parts += [f"{resumed} resume{'s' * (resumed == 1)} at epoch {_range(begun)}"] if resumed else []
-        end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
+        end = f" Ctrl-C saves; the same {self.again} continues."
+        if self.entry.script is not None:
+            end = f" After Ctrl-C the same {self.again} starts unfinished seeds again."
+        end = "" if submits else end
         self.console.print("; ".join(parts) + "." + end)
         notes = [f"note: {line}" for line in self.entry.unusable(self.epochs)]
         model = self.entry.model
@@ -405,9 +408,7 @@ class RunDisplay:
     def interrupted(self) -> None:
         """Say that everything is safe."""
         self.close()
-        self.console.print(
-            f"stopped; every finished epoch is saved. The same {self.again} continues from there."
-        )
+        self.console.print(f"stopped; {self._goes_on}.")
 
     def out_of_time(self, budget: str) -> None:
         """Print that the budget has ended, the epochs so far, and the command that continues."""
@@ -415,10 +416,17 @@ class RunDisplay:
         epochs = _range([int(state.get("epoch") or 0) for state in self._last.values()] or [0])
         limit = "--budget" if self.again == "command" else "`budget`"
         self.console.print(
-            f"stopped after {budget}, at epoch {epochs} of {self.epochs}; every finished epoch is saved. The "
-            f"same {self.again} continues from there, and without {limit} to the end.",
+            f"stopped after {budget}, at epoch {epochs} of {self.epochs}; {self._goes_on}, and without {limit} to the "
+            "end.",
             soft_wrap=True,
         )
+
+    @property
+    def _goes_on(self) -> str:
+        """What is saved of stopped training, and how it goes on."""
+        if self.entry.script is not None:
+            return f"every finished seed is saved. The same {self.again} starts the others again"
+        return f"every finished epoch is saved. The same {self.again} continues from there"
 
     def finished(self, summary: dict[str, Any], at_work: Sequence[GroupStatus] = ()) -> None:
         """Print a summary, the groups that others train, and the next command."""

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from qrlsuite.engine import script
 from qrlsuite.engine.budget import Budget, seconds
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.terminal import printable
+from qrlsuite.engine.terminal import command, printable
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import EngineOutcome, Missing, Snapshot, raise_failures
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
@@ -25,7 +26,7 @@ from qrlsuite.results import checkpoint, codes, probes, requests, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup, format_seeds, plan_groups
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, entries
 from qrlsuite.results.text import counted, duration_range
 from qrlsuite.statistics.curves import reached
 from qrlsuite.training import device as devices
@@ -49,14 +50,36 @@ def find(
         As `settle_codes` returned it; None computes it.
     """
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
-    last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
+    last = entry.epochs if epochs is None else epochs
     code = code or identity.of(entry)
     store = codes.place(runs, entry, code)
     busy = {seed for claim in certain(store) for seed in claim.seeds} | where.engine.queued(store)
     busy &= set(requested)
     left = sorted(set(requested) - busy)
+    if entry.script is not None:
+        _require_one_command(runs, entry)
+        if last > entry.epochs:
+            raise OptionError(
+                f"'{entry.label}' ends after {entry.epochs} epochs: for {last}, say "
+                f"steps={last * entry.task.file.protocol.interactions}"
+            )
+        done = store.finished(left, last)
+        groups = [SeedGroup((seed,), 0) for seed in left if seed not in done]
+        return Missing(runs, entry, store, requested, last, frozenset(busy), groups, code)
     missing = plan_groups(store, left, last, where.workers)
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing, code)
+
+
+def _require_one_command(runs: Path, entry: Entry) -> None:
+    """Refuse a script under a name that another command has here: boards and pictures show the name alone."""
+    for store in entries(runs, entry.task.name) if runs.is_dir() else ():
+        with contextlib.suppress(StoreError):  # is said where it is read
+            record = store.record()
+            if record.label == entry.label and record.hash != entry.hash:
+                raise OptionError(
+                    f"{store.path} is '{entry.label}' of another command: give this one another name, or remove that: "
+                    f"{command('runs', 'rm', f'{entry.task.name}/{store.path.name}', runs=runs)}"
+                )
 
 
 def settle_codes(
@@ -71,6 +94,8 @@ def settle_codes(
         raise OptionError(
             "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
         )
+    for entry in entries:
+        script.require_typed(entry)
     anew, found = [], [identity.of(entry) for entry in entries]
     for entry, code in zip(entries, found):
         store = codes.place(runs, entry, code)
@@ -130,7 +155,7 @@ def require_trainable(entries: Sequence[Entry], where: Where, quiet: bool = Fals
 
     unanswered = []
     alike: dict[str, list[Entry]] = {}
-    for entry in entries:
+    for entry in (entry for entry in entries if entry.script is None):
         alike.setdefault(entry.population_key, []).append(entry)
     for population in alike.values():
         try:
@@ -214,7 +239,13 @@ def train(
         display.console.print(probe, markup=False, soft_wrap=True)
     for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
         display.console.print(f"warning: {printable(message)}", markup=False, emoji=False, soft_wrap=True)
-    if fresh and outcome.failed and not work.store.seeds() and not living(work.store):
+    if (
+        fresh
+        and outcome.failed
+        and work.entry.script is None
+        and not work.store.seeds()
+        and not living(work.store)
+    ):
         _remove(work.store.path)
         raise QrlSuiteError("; ".join(sorted(set(outcome.failed.values()))))
     raise_failures(outcome)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite import options, registry, specs
+from qrlsuite.engine import script
 from qrlsuite.engine.work import Engine, EngineOutcome, Missing, Show, Work
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.notation import parse_named
@@ -68,7 +69,8 @@ class Where:
         if len(several) > 1:
             return self.engine.run(self._populations(several), show)
         [missing] = several
-        work = Work(missing.store, missing.groups, missing.epochs, self.workers, self.device)
+        words = script.words(missing.entry)
+        work = Work(missing.store, missing.groups, missing.epochs, self.workers, self.device, script=words)
         return self.engine.run([work], show)
 
     @property

@@ -76,6 +76,8 @@ class Work:
     others:
         Folders of further entries whose seeds are trained in the same populations; only an engine whose groups run on
         this machine gets any. `worker_command` names them.
+    script:
+        Words of `worker_command` that hand a script's command over; a worker starts no other.
     """
 
     store: EntryStore
@@ -84,6 +86,7 @@ class Work:
     workers: int
     device: str = "cpu"
     others: Sequence[EntryStore] = ()
+    script: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,7 @@ def worker_command(work: Work, group: SeedGroup) -> list[str]:
         str(work.epochs),
         "--device",
         work.device,
+        *work.script,
     ]
 
 

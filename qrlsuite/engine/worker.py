@@ -15,8 +15,8 @@ import contextlib
 import ctypes
 import gc
 import itertools
+import json
 import os
-import resource
 import signal
 import sys
 import threading
@@ -25,11 +25,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qrlsuite.engine import probe as probing
+from qrlsuite.engine import script
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import codes, probes
 from qrlsuite.results.checkpoint import group_id
 from qrlsuite.results.claims import HEARTBEAT, HEARTBEAT_THREAD, Claim, SeedsClaimedError, acquire, living
-from qrlsuite.results.progress import Progress, ProgressFile
+from qrlsuite.results.progress import Progress, ProgressFile, most_memory
 from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import counted
@@ -90,7 +91,7 @@ def train_group(
 
     def report(progress: Progress, error: str | None = None, force: bool = False) -> None:
         if progress.done:
-            progress.memory = _most_memory()
+            progress.memory = most_memory()
         for path, file in files.items():
             file.write(progress, error, force, places.get(path, slice(0)))
 
@@ -161,16 +162,34 @@ def divided(parts: Sequence[Part], size: int) -> Iterator[list[Part]]:
         yield [(*parts[place][:2], [seed for _, seed in its]) for place, its in piece]
 
 
-def _most_memory() -> int:
-    """Return the most bytes that this process has had in memory."""
-    with contextlib.suppress(
-        OSError, ValueError, IndexError
-    ):  # `getrusage` on Linux counts a parent that forked
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
+def train_script(folder: Path, seeds: Sequence[int], started: str, parent: int | None = None) -> None:
+    """Claim seeds and have a command train the unfinished ones, one after the other.
+
+    Parameters
+    ----------
+    started:
+        What to start, from the command line of this process: see `qrlsuite.engine.script.words`.
+    """
+    store = EntryStore(folder)
+    claim = acquire(store, seeds)
+    heartbeat = ClaimHeartbeat([claim], parent)
+    heartbeat.start()
+    file, state = ProgressFile(store, group_id(seeds)), Progress(phase="training", size=len(seeds))
+    try:
+        entry = script.read(json.loads(started), store)
+        state.epochs = entry.epochs
+        file.write(state, force=True)
+        for seed in seeds:
+            script.train(entry, store, seed, file.path.with_name("output.txt"), state, file.write)
+        state.phase, state.epoch = "finished", entry.epochs
+        file.write(state, force=True)
+    except QrlSuiteError as error:
+        with contextlib.suppress(StoreError):
+            file.write(state, str(error), force=True)
+        raise
+    finally:
+        heartbeat.stopped.set()
+        claim.release()
 
 
 def _stop_others(claims: Sequence[Claim]) -> None:
@@ -234,15 +253,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--follow-parent", type=int, metavar="PID", help="stop, saving, when this parent process ends"
     )
+    parser.add_argument(
+        "--script", metavar="JSON", help="the command that trains a seed, and where it writes"
+    )
     options = parser.parse_args(arguments)
     if options.follow_parent is not None and not end_with(options.follow_parent):
         return 130
     try:
-        _import_training()
         folder, *others = options.folders
+        seeds, parent = parse_seeds(options.seeds), options.follow_parent
+        if options.script is not None:
+            train_script(folder, seeds, options.script, parent)
+            return 0
+        _import_training()
         for path in options.folders:
             codes.load_copies(EntryStore(path))
-        seeds, parent = parse_seeds(options.seeds), options.follow_parent
         train_group(folder, seeds, options.epochs, options.device, parent, others)
     except SeedsClaimedError as error:
         print(f"qrlsuite: {error}", file=sys.stderr)
@@ -250,6 +275,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except QrlSuiteError as error:
         print(f"qrlsuite: {error}", file=sys.stderr)
         return 2
+    except script.KilledError as error:
+        print(f"qrlsuite: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 130
     return 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,11 @@ from typing import Any
 from qrlsuite import notation, options, registry, specs
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset as presets
-from qrlsuite.experiment.task import Task, digest, load
+from qrlsuite.experiment import script as scripts
+from qrlsuite.experiment.script import SCRIPT, Script
+from qrlsuite.experiment.task import EXTERNAL, Nothing, Task, digest, load
 from qrlsuite.notation import Written
 from qrlsuite.options import Setting
-
-EXTERNAL = "external"
-"""Name of the algorithm, and of the task's environment, of entries whose curves another program made."""
 
 START_FORM = re.compile(r"[a-z0-9][a-z0-9+._-]*/[a-z0-9][a-z0-9+._@-]*:[1-9][0-9]{0,8}")
 """Where training begins, see `Entry.start`."""
@@ -43,6 +42,9 @@ class Entry:
     start:
         `TASK/ENTRY:EPOCHS` if training begins with the agents of another entry after so many epochs, seed k with that
         entry's seed k; part of the identity.
+    folder:
+        Where a script's command is started; set if it was typed in this call or stands in the study file that this call
+        names. Without it, the command is never started.
     """
 
     task: Task
@@ -54,6 +56,24 @@ class Entry:
     tuning: dict[str, Any] | None = field(default=None, compare=False)
     study: str | None = field(default=None, compare=False)
     start: str | None = None
+    folder: Path | None = field(default=None, compare=False)
+
+    @property
+    def script(self) -> Script | None:
+        """The script that trains it, where one does."""
+        return self.algorithm_options if isinstance(self.algorithm_options, Script) else None
+
+    @property
+    def epochs(self) -> int:
+        """The epochs of a complete run."""
+        if self.script is not None:
+            return (self.script.steps or 0) // self.task.file.protocol.interactions
+        return self.task.epochs(self.algorithm.name)
+
+    def for_epochs(self, epochs: int) -> Entry:
+        """Return a script's entry with other steps: schedules depend on them, so it is another entry."""
+        steps = epochs * self.task.file.protocol.interactions
+        return replace(self, algorithm_options=replace(self.algorithm_options, steps=steps))
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -99,6 +119,9 @@ class Entry:
         `resolve` makes the entry of it again, on the same task. Only an option that was added later
         (`qrlsuite.options.Since`) is not written where it has its default, whatever the task's preset says now.
         """
+        if self.script is not None:
+            usual_steps = self.epochs == self.task.epochs(SCRIPT)
+            return f"{SCRIPT} {self.model.name}" + ("" if usual_steps else f" steps={self.script.steps}")
         own = {"model": self.model_options, "algorithm": self.algorithm_options}
         usual = {
             "model": options.plain(specs.resolve(self.model.options)()),
@@ -138,6 +161,8 @@ class Entry:
 
         Where the model has them, its `ansatz` and its circuit `backend`, too.
         """
+        if self.script is not None:
+            return {}
         known = registry.load()
         named: dict[str, tuple[type[specs.NumericSpec], Any]] = {
             "environment": (specs.EnvironmentSpec, self.task.environment.name),
@@ -166,7 +191,9 @@ class Entry:
         return list(dict.fromkeys(each.distribution for each in self.registered().values()))
 
     def third_party(self) -> list[str]:
-        """Return the distributions other than this suite."""
+        """Return the distributions other than this suite, or the script."""
+        if self.script is not None:
+            return [self.model.name]
         return [name for name in self.distributions() if name != "qrlsuite"]
 
 
@@ -199,6 +226,10 @@ def resolve(
         raise OptionError(
             f"{notation.START}={written.start}: write TASK/ENTRY:EPOCHS, or run it with --from ENTRY"
         )
+    if written.algorithm == SCRIPT:
+        if written.preset is not None or written.start is not None:
+            raise OptionError(f"script '{written.model}' has no preset, and no agents to begin with")
+        return of_script(task, written.model, scripts.read(written.model, written.settings))
     task = task if isinstance(task, Task) else load(task)
     model = registry.get(specs.ModelSpec, written.model)
     file = _preset_file(written)
@@ -240,6 +271,13 @@ def _size(sides: Mapping[str, type[Any]], values: Mapping[str, Any]) -> dict[str
     chosen = {**options.plain(sides["model"]()), **values}["ansatz"]
     registered = registry.load().of(specs.AnsatzSpec)
     return registered[chosen].spec.size if chosen in registered else {}
+
+
+def of_script(task: str | Task, name: str, script: Script) -> Entry:
+    """Build the entry of a script; without a `folder`, its command is never started."""
+    algorithm, model = scripts.parts(name)
+    its_task, script = scripts.place(task, script)
+    return Entry(its_task, algorithm, model, script, Nothing(), None)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@
     their plugin              all other files that it installs, or that belong to the plugin by path
     a file that an option     its bytes
     names
+    a script                  every file that its command names, and what a Python script imports beside itself
 
 The parts as canonical JSON give the digest, 16 hexadecimal digits of SHA-256. Engines, trackers and rules compute
 nothing of an entry. Tests and documents of a package are no part of it.
@@ -28,6 +29,7 @@ from typing import Any
 
 from qrlsuite import circuit, options, own, registry, specs
 from qrlsuite.circuit.description import Circuit, canonical
+from qrlsuite.experiment import script as scripts
 from qrlsuite.experiment import source
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.task import digest
@@ -83,7 +85,10 @@ class CodeIdentity:
 
 
 def of(entry: Entry) -> CodeIdentity:
-    """Compute an entry's code identity from the installed code."""
+    """Compute an entry's code identity from the installed code; a script's from where its command is started."""
+    if entry.script is not None:
+        folder = entry.folder
+        return CodeIdentity(() if folder is None else (scripts.code(entry.model.name, entry.script, folder),))
     parts = [
         _part(role, each, circuit_of(entry) if role == "ansatz" else None, _environment_id(entry, role))
         for role, each in entry.registered().items()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
+import pydantic.dataclasses
 from pydantic import (
     Field,
     PrivateAttr,
@@ -22,9 +24,26 @@ import qrlsuite
 from qrlsuite import files, options, own, registry, specs
 from qrlsuite.errors import FileError, OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.preset import TuningRecord
+from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.grid import Goal, Grid
 
 FORMAT_VERSION = 1
+
+EXTERNAL = "external"
+"""Name of the environment of tasks that the suite does not know, and of the algorithm of imported curves."""
+
+_EPSILONS, _REFERENCE = [0.1, 0.2, 0.3, 0.4], 0.2
+_DELTAS, _DELTA = [0.5, 0.75], 0.5
+
+
+@pydantic.dataclasses.dataclass(frozen=True)
+class Nothing:
+    """No options."""
+
+
+_EXTERNAL = specs.EnvironmentSpec(
+    EXTERNAL, "An environment of another program", "qrlsuite.experiment.task:Nothing", ""
+)
 
 
 class EnvironmentSection(options.Table):
@@ -330,7 +349,8 @@ class Task:
         self.source = source
         self.name = file.name
         try:
-            self.environment = registry.get(specs.EnvironmentSpec, file.environment.name)
+            name = file.environment.name
+            self.environment = _EXTERNAL if name == EXTERNAL else registry.get(specs.EnvironmentSpec, name)
         except UnknownNameError as error:
             raise UnknownNameError(f"{source}: environment.name: {error}") from None
         cls = specs.resolve(self.environment.options)
@@ -376,6 +396,13 @@ class Task:
     def epochs(self, algorithm: str) -> int:
         """Return the epochs of a complete run of an algorithm."""
         return self.file.protocol.algorithm_epochs.get(algorithm, self.file.protocol.epochs)
+
+    def with_scores(self, kind: str) -> Task:
+        """Return the task of scores of another kind, such as `training`, which its own are not compared with."""
+        changed = copy.copy(self)
+        changed.name, changed.definition = f"{self.name}+{kind}", {**self.definition, "scores": kind}
+        changed.hash = digest(changed.definition)
+        return changed
 
     def with_environment(self, values: dict[str, Any]) -> Task:
         """Return the task with other environment options, under a name that says so."""
@@ -452,6 +479,72 @@ def digest(content: Any) -> str:
     """Return 16 hexadecimal digits of SHA-256 over content in canonical JSON."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def external(
+    name: str,
+    every: int,
+    epochs: int,
+    maximum: float | None,
+    thresholds: Sequence[float],
+    score: Mapping[str, Any],
+    horizon: int | None = None,
+) -> TaskFile:
+    """Return the file of a task whose environment only other programs know.
+
+    Parameters
+    ----------
+    every, epochs:
+        Environment steps of an epoch, and epochs of a run.
+    maximum:
+        The best possible score: scores become fractions of it.
+    thresholds:
+        Scores that count as reached, sorted; by default .6, .7, .8 and .9 of the maximum.
+    score:
+        The section `[score]`.
+    horizon:
+        Epochs at which entries are compared; None is all.
+    """
+    if maximum is None and not thresholds:
+        raise OptionError(
+            f"{name!a} is a new task: say what a good score is with maximum=BEST (the best possible), "
+            "thresholds=A,B,... (scores that count as reached; with goal=below less is better), or --task TASK of the "
+            "suite"
+        )
+    hardest = 0 if score.get("goal") == "below" else -1
+    ranking: dict[str, Any] = {
+        "thresholds": [*thresholds],
+        "reference": {"threshold": (thresholds or [0])[hardest]},
+    }
+    if maximum is not None:
+        epsilons = [round(1 - level / maximum, 12) for level in reversed(thresholds)] or _EPSILONS
+        ranking = {"epsilons": epsilons, "reference": {"epsilon": epsilons[0] if thresholds else _REFERENCE}}
+    content = {
+        "format_version": 1,
+        "name": name,
+        "summary": "Learning curves that other programs made",
+        "environment": {"name": EXTERNAL},
+        "protocol": {
+            "seeds": MIN_RUNS,
+            "epochs": epochs,
+            "environments": 1,
+            "interactions": every,
+            "validation_episodes": 1,
+        },
+        "score": dict(score),
+        "ranking": {
+            **ranking,
+            "reference": {**ranking["reference"], "delta": _DELTA},
+            "deltas": _DELTAS,
+            "horizons": [(horizon or epochs) * every],
+        },
+    }
+    try:
+        return TaskFile.model_validate(content)
+    except pydantic.ValidationError as error:
+        raise OptionError(
+            f"--task {ascii(name)[1:-1]}: {'; '.join(files.problems(error, TaskFile))}"
+        ) from None
 
 
 def parse(text: str, source: str, folder: Path | None = None) -> Task:

@@ -169,6 +169,33 @@ def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Po
     return rows.points()
 
 
+def read_run(paths: Sequence[Path], metric: str | None = None) -> Points:
+    """Read the files of one run, whose entry and seed are known: a csv file needs the columns of step and score alone.
+
+    Of several scores at one step, as lanes write them whose episodes end at once, the last counts.
+    """
+    rows, at, source = _Rows(), dict[int, float](), str(paths[0])
+    if run_files.holds_one_run(paths[0]):
+        name, curve = run_files.read(paths, metric)
+        at.update(curve)
+    else:
+        content = cells_of(paths[0], lines_of(paths[0]))
+        _, head = next(content, (0, list[str]()))
+        names = [each.strip() for each in head]
+        columns = _columns(names, metric, source, COLUMNS[2:])
+        (time, value), name = map(names.index, columns), _measure(columns)
+        for line, cells in content:
+            try:
+                at[whole(cells[time])] = float(cells[value])
+            except (ValueError, IndexError, OverflowError):
+                raise FileError(
+                    f"{source}, line {line}: no step and score: {','.join(cells)[:80]!a}"
+                ) from None
+    for step, score in at.items():
+        rows.add("run", 0, step, score, source, name)
+    return next(iter(rows.points().values()))
+
+
 def _read_csv(path: Path, rows: _Rows, metric: str | None) -> None:
     content = cells_of(path, lines_of(path))
     _, head = next(content, (0, list[str]()))
@@ -267,11 +294,13 @@ def _column(column: str, names: Sequence[str], but: Sequence[str] = ()) -> list[
     return next(filter(None, levels), [])
 
 
-def _columns(names: Sequence[str], metric: str | None, source: str) -> list[str]:
-    """Return the names of the four columns."""
+def _columns(
+    names: Sequence[str], metric: str | None, source: str, wanted: Sequence[str] = COLUMNS
+) -> list[str]:
+    """Return the names of the wanted columns."""
     found: dict[str, str] = {}
     wrong, several = list[str](), list[str]()
-    for column in NAMES:
+    for column in (column for column in NAMES if column in wanted):
         own = metric is not None and column == "score"
         alike = (
             [name for name in names if name == metric] if own else _column(column, names, [*found.values()])
@@ -290,11 +319,9 @@ def _columns(names: Sequence[str], metric: str | None, source: str) -> list[str]
             else ""
         )
         which = f"; rename all of {', '.join(several)} but one" if len(set(several)) > 1 else ""
-        raise FileError(
-            f"{source}: expected the columns {', '.join((*COLUMNS[:3], metric or COLUMNS[3]))}, each once; found {here}"
-            f"{which}{other}"
-        )
-    return [found[column] for column in COLUMNS]
+        expected = ", ".join((*wanted[:-1], metric or COLUMNS[3]))
+        raise FileError(f"{source}: expected the columns {expected}, each once; found {here}{which}{other}")
+    return [found[column] for column in wanted]
 
 
 def _measure(columns: Sequence[str]) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import resource
 import statistics
+import sys
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -121,6 +124,20 @@ class ProgressFile:
             raise StoreError(f"cannot write {self.path}: {cause(error)}") from None
         if size < seeds:
             self.write(Progress(size=size), force=True)
+
+
+def most_memory(process: int | str = "self") -> int:
+    """Return the most bytes that a process has had in memory; 0 where that is unknown of another one."""
+    with contextlib.suppress(
+        OSError, ValueError, IndexError
+    ):  # `getrusage` on Linux counts a parent that forked
+        for line in Path(f"/proc/{process}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    if process != "self":
+        return 0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
 
 
 def read_progress(path: Path) -> dict[str, Any]:

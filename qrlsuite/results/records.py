@@ -15,6 +15,7 @@ later versions: that is written again. A key that may be absent has a default, w
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -30,9 +31,11 @@ from pydantic import (
 
 from qrlsuite import files, notation, options, registry, specs
 from qrlsuite.errors import StoreError
-from qrlsuite.experiment.entry import START_FORM, Entry
+from qrlsuite.experiment import script as scripts
+from qrlsuite.experiment.entry import START_FORM, Entry, of_script
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.preset import EntryTuning
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task, TaskFile, digest
 
 FORMAT_VERSION = 1
@@ -347,6 +350,7 @@ class EntryRecord(CodedRecord):
     def of(cls, entry: Entry) -> EntryRecord:
         """Return the record of an entry."""
         tuned = {} if entry.tuning is None else {"tuning": entry.tuning}
+        made = {} if entry.script is None else {"imported": {"kind": entry.script.scores}}
         planned = {} if entry.study is None else {"plan": entry.study}
         file = entry.task.file.model_dump(mode="json", exclude={"tuning"})
         if entry.task.name in registry.load().of(specs.TaskSpec):
@@ -359,6 +363,7 @@ class EntryRecord(CodedRecord):
                 "preset": entry.preset,
                 **tuned,
                 **planned,
+                **made,
                 "task_name": entry.task.name,
                 "task_hash": entry.task.hash,
                 "task_file": file,
@@ -382,8 +387,12 @@ class EntryRecord(CodedRecord):
         return [declared.codes for declared in self.same]
 
     def entry(self, source: str) -> Entry:
-        """Build the entry; `source` is where the record came from, for messages."""
+        """Build the entry; `source` is where the record came from, for messages. A script's is never started."""
         task = Task(self.task_file, source)
+        if self.identity.algorithm == SCRIPT:
+            name = self.identity.model
+            entry = of_script(task, name, scripts.build(name, self.identity.algorithm_options))
+            return self._same(replace(entry, tuning=self.tuned, study=self.plan), source)
         task.name = self.task_name
         algorithm = registry.get(specs.AlgorithmSpec, self.identity.algorithm)
         model = registry.get(specs.ModelSpec, self.identity.model)
@@ -402,6 +411,10 @@ class EntryRecord(CodedRecord):
             study=self.plan,
             start=self.identity.start,
         )
+        return self._same(entry, source)
+
+    def _same(self, entry: Entry, source: str) -> Entry:
+        """Return the entry that was built, if it has the record's hash."""
         if entry.hash != self.hash:
             raise StoreError(
                 f"{source} was made by a version of the suite or a plugin in which its options meant something else "

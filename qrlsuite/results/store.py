@@ -40,6 +40,7 @@ from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import EntryTuning
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.files import read_bytes
 from qrlsuite.results import genuine, parquet
 from qrlsuite.results.records import (
@@ -700,9 +701,9 @@ class EntryStore:
         """Build the entry that the folder belongs to."""
         record = self.record()
         if record.imported:
+            kept = "evaluated" if record.identity.algorithm == SCRIPT else "trained, evaluated or published"
             raise StoreError(
-                f"{self.path} holds curves that another program made: they can be compared, not trained, evaluated or "
-                "published"
+                f"{self.path} holds curves that another program made: they can be compared, not {kept}"
             )
         try:
             entry = record.entry(str(self.path / "entry.json"))

@@ -390,6 +390,7 @@ def new(
     runs: Path,
     *,
     first_seed: int | None = None,
+    folder: Path = Path(),
     **looks: Any,
 ) -> Study:
     """Return a new study with looks, dated now; writes nothing.
@@ -402,6 +403,8 @@ def new(
         were found.
     first_seed:
         None for the first block from 10,000 without a trained seed below `runs`.
+    folder:
+        Where commands of scripts are started: the folder of the study's file.
     looks:
         Further fields of `LooksSection`; None takes the default.
     """
@@ -417,7 +420,7 @@ def new(
                 EntriesSection(task=task, model=text, name=name or None)
                 for name, text in map(_named, entries)
             ],
-        )
+        ).started_in(folder)
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(files.problems(error, StudyFile))) from None
     study = Study(file.of("the study"), runs)
@@ -489,7 +492,7 @@ def _fixed(file: StudyFile) -> tuple[StudyFile, list[Member]]:
 
 
 def _common_epochs(source: str, entries: Sequence[Entry]) -> int:
-    lengths = {entry.label: entry.task.epochs(entry.algorithm.name) for entry in entries}
+    lengths = {entry.label: entry.epochs for entry in entries}
     if len(set(lengths.values())) > 1:
         steps = entries[0].task.file.protocol.interactions
         ends = ", ".join(f"'{label}' at {count * steps} steps" for label, count in lengths.items())

@@ -21,6 +21,7 @@ from qrlsuite import files, notation, options, own, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.preset import EntryTuning
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting, Table
@@ -168,6 +169,7 @@ class StudyFile(Table):
     """A study: its entries, what it asks and when to look, and its pictures."""
 
     _origin: str = PrivateAttr("")
+    _folder: Path | None = PrivateAttr(None)
     format_version: Literal[1]
     name: Name
     summary: Annotated[str, Field(min_length=1)]
@@ -218,6 +220,12 @@ class StudyFile(Table):
         named._origin = origin
         return named
 
+    def started_in(self, folder: Path) -> StudyFile:
+        """Return the study, named in this call, with the folder where it starts commands of scripts."""
+        named = self.model_copy()
+        named._folder = folder.absolute()
+        return named
+
     def members(
         self, settings: Sequence[Setting] = (), models: Mapping[str, str] | None = None
     ) -> list[Member]:
@@ -241,8 +249,10 @@ class StudyFile(Table):
             try:
                 for draft, target in itertools.product(_drafts(group), targets):
                     named.add(draft.written.model)
-                    task = task_of(draft.task)
+                    # a script may define a task that nothing else knows
+                    task = draft.task if draft.written.algorithm == SCRIPT else task_of(draft.task)
                     member = _member(group, draft, task, settings, models, target, used)
+                    member = replace(member, entry=replace(member.entry, folder=self._folder))
                     members.setdefault((member.entry.task.name, member.entry.name), member)
             except QrlSuiteError as error:
                 place = f"entries.{index}" if group.name is None else f"group '{group.name}'"
@@ -301,14 +311,14 @@ def _drafts(group: EntriesSection) -> Iterator[_Draft]:
 def _member(
     group: EntriesSection,
     draft: _Draft,
-    task: Task,
+    task: Task | str,
     settings: Sequence[Setting],
     models: Mapping[str, str],
     target: Entry | None,
     used: set[tuple[str | None, str]],
 ) -> Member:
     written = replace(draft.written, model=models.get(draft.written.model, draft.written.model))
-    applicable = _applicable(written, task, settings) if settings else []
+    applicable = _applicable(written, task, settings) if settings and isinstance(task, Task) else []
     used |= {(s.side, s.name) for s in applicable}
     all_settings = [*written.settings, *applicable]
 
@@ -399,7 +409,7 @@ def dumps(file: StudyFile) -> str:
 def load(name: str) -> StudyFile:
     """Load a registered study by name, or a study file by path (anything that ends in `.toml`), with its plugins."""
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
-    return parse(files.read(path, "study file"), path.name, path.parent)
+    return parse(files.read(path, "study file"), path.name, path.parent).started_in(path.parent)
 
 
 def load_kept(path: Path) -> StudyFile:

@@ -226,7 +226,7 @@ class Search(Shown):
         self.runs = results / FOLDER
         self.notation = notation.parse_entry(request.entry).given(settings=request.settings)
         self.base = self._entry()
-        self.epochs = request.epochs or self.base.task.epochs(self.base.algorithm.name)
+        self.epochs = request.epochs or self.base.epochs
         self.trials: list[Trial] = []
         self.pending: list[Entry] = []
         self.written: Path | None = None

@@ -144,7 +144,7 @@ def test_a_group_begins_where_it_fits_beside_the_first(
 
 def test_the_memory_of_the_process_that_started_a_worker_is_not_the_workers() -> None:
     ballast = b"\1" * (600 << 20)
-    code = "from qrlsuite.engine import worker; print(worker._most_memory())"
+    code = "from qrlsuite.results import progress; print(progress.most_memory())"
     run = subprocess.run(
         [sys.executable, "-c", code], preexec_fn=local._ignore_warnings, stdout=subprocess.PIPE, check=True
     )

@@ -33,6 +33,7 @@ from qrlsuite.engine.missing import summarize
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import load
 from qrlsuite.notation import Written, parse_entry, split, write_setting
 
@@ -104,8 +105,12 @@ def run(
     Stop with Ctrl-C at any time; the same command continues where it stopped. More --seeds or --epochs add to
     earlier results; repeating a finished command does nothing.
 
+    A script of your own is an entry, too: a process for each seed, started without a shell. curve=PATTERN says where it
+    writes its learning curve; default: where CleanRL does.
+
     Examples: qrlsuite run mlp width=16 --task beam6g --seeds 20; qrlsuite run --task beam6g --model vqc-pennylane
-    --set qubits=6
+    --set qubits=6; qrlsuite run script ppo-mine command="python ppo.py --seed {seed} --total-timesteps {steps}"
+    curve="logs/{seed}.csv" metric=episodic_return --task cartpole --seeds 20
     """
     where = where_of(engine, workers, device, same)
     written = _written(entry or [], model, settings or [], quick)
@@ -171,11 +176,13 @@ def _written(words: list[str], model: str | None, settings: list[str], quick: bo
     if not words or model is not None:
         problem = f"'{' '.join(words)}' and --model {model}: give one of them" if words else "name a model"
         raise OptionError(f"{problem}, for example: qrlsuite run mlp width=16 --task beam6g")
+    # a script's command is one word of the shell
+    words = [write_setting(*word.split("=", 1)) if word.startswith("command=") else word for word in words]
     written = parse_entry(" ".join(words)).given(settings=tuple(map(options.parse_setting, settings)))
     if not quick or any(setting.name == "qubits" for setting in written.settings):
         return written
     ansatzes = registry.load().of(specs.AnsatzSpec)
-    if any(
+    if written.algorithm == SCRIPT or any(
         each.name == "ansatz" and each.value in ansatzes and ansatzes[str(each.value)].spec.size
         for each in written.settings
     ):

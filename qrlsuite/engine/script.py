@@ -1,0 +1,305 @@
+"""Trains one seed of a script's entry: starts the command, follows the curve that it writes, and stores that.
+
+A seed is stored whole, when its command has ended well; one that was killed begins again. The command comes with the
+worker's own command line, from the call that opened the queue: an entry's folder starts nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import datetime
+import os
+import resource
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite import options
+from qrlsuite.engine.terminal import printable
+from qrlsuite.errors import FileError, QrlSuiteError, StoreError, listed
+from qrlsuite.experiment import identity
+from qrlsuite.experiment import script as scripts
+from qrlsuite.experiment.entry import Entry, of_script
+from qrlsuite.experiment.script import SCRIPT
+from qrlsuite.experiment.task import Task
+from qrlsuite.results import codes, points, provenance
+from qrlsuite.results.points import Points
+from qrlsuite.results.progress import Progress, most_memory
+from qrlsuite.results.records import RunRecord
+from qrlsuite.results.store import (
+    EntryStore,
+    SeedStore,
+    json_line,
+    round_means,
+    table_bytes,
+    write_atomically,
+)
+from qrlsuite.training.interrupts import Interruptible
+
+LOOK_SECONDS = 1.0
+"""Seconds between two looks at a curve, at least; reading it takes at most a tenth of the time."""
+
+PATIENCE = 10.0
+"""Seconds that a command has to end when it is told to."""
+
+REST = 0.1
+"""Share of a run, at most, after its last score, which holds there: an episode that has not ended has none."""
+
+KILL_WITH_PARENT = 1, signal.SIGKILL
+"""Arguments of Linux's `prctl`: the command does not survive its worker."""
+
+Report = Callable[[Progress], None]
+
+
+class KilledError(Exception):
+    """A signal ended the command: the worker ends, too, and is started again."""
+
+
+def require_typed(entry: Entry) -> None:
+    """Refuse a script whose command was neither typed in this call nor stands in the study file that it names."""
+    if entry.script is not None and entry.folder is None:
+        raise QrlSuiteError(
+            f"'{entry.label}' was found in a results folder: its command is started only if you type it, or name the "
+            "study file that has it"
+        )
+
+
+def words(entry: Entry) -> list[str]:
+    """Return the words of a worker's command line that hand over what is to be started; none for other entries."""
+    require_typed(entry)
+    if entry.script is None:
+        return []
+    values = {"folder": str(entry.folder), **options.plain(entry.script)}
+    return ["--script", json_line(values).decode().strip()]
+
+
+def read(values: Mapping[str, Any], store: EntryStore) -> Entry:
+    """Return the entry that a worker's command line hands over; its folder's record has to be that entry's."""
+    record = store.record()
+    task = Task(record.task_file, str(store.path))
+    given = {name: value for name, value in values.items() if name != "folder"}
+    entry = of_script(task, record.identity.model, scripts.build(record.identity.model, given))
+    if record.identity.algorithm != SCRIPT or entry.hash != record.hash:
+        raise StoreError(f"{store.path} is not the entry of this command: nothing was started")
+    return replace(entry, folder=Path(values["folder"]), study=record.plan)
+
+
+def train(
+    entry: Entry, store: EntryStore, seed: int, output: Path, progress: Progress, report: Report
+) -> None:
+    """Start the command for a seed, follow its curve, and store that; with the files that are there now.
+
+    Parameters
+    ----------
+    output:
+        The file for all that the command prints.
+    """
+    if store.finished([seed], entry.epochs):
+        return
+    codes.require(store, identity.of(entry), socket.gethostname())
+    run, before = _Run(entry, seed, output), resource.getrusage(resource.RUSAGE_CHILDREN)
+    run.follow(progress, report)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    _store(entry, store, seed, *run.curve(), cpu)
+
+
+class _Run:
+    """One start of the command."""
+
+    def __init__(self, entry: Entry, seed: int, output: Path) -> None:
+        assert entry.script is not None
+        assert entry.folder is not None
+        self.script, self.folder, self.seed, self.output = entry.script, entry.folder, seed, output
+        self.file, self.epochs = entry.task.file, entry.epochs
+        self.words = self.script.words(seed)
+        self._before = self._files()
+
+    def _files(self) -> dict[Path, tuple[int, int]]:
+        """Return the files that the pattern names, with time and size: those of earlier runs do not change."""
+        found = {}
+        for path in self.script.files(self.seed, self.folder):
+            with contextlib.suppress(OSError):
+                status = path.stat()
+                found[path] = status.st_mtime_ns, status.st_size
+        return found
+
+    def follow(self, progress: Progress, report: Report) -> None:
+        """Run the command to its end; report how far its curve is."""
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        began, pause = time.monotonic(), LOOK_SECONDS
+        with self.output.open("wb") as output, Interruptible() as guard:
+            with guard.deferred():  # a command without a name is not stopped
+                process = _start(self.words, self.folder, output)
+            try:
+                while process.poll() is None:
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(pause)
+                    looked = time.monotonic()
+                    self._look(progress, looked - began)
+                    progress.memory = most_memory(process.pid) or progress.memory
+                    report(progress)
+                    pause = max(LOOK_SECONDS, 10 * (time.monotonic() - looked))
+            finally:
+                with guard.deferred():
+                    _end(process)
+        if process.returncode < 0:
+            raise KilledError(f"{self.told} was ended by {signal.Signals(-process.returncode).name}")
+        if process.returncode:
+            lines = self.output.read_text(errors="replace").strip().splitlines() or ["it printed nothing"]
+            raise QrlSuiteError(
+                f"{self.told} ended with exit code {process.returncode}: {printable(lines[-1])[:300]} (all that it "
+                f"printed: {self.output})"
+            )
+
+    @property
+    def told(self) -> str:
+        """The seed and the command, for messages."""
+        return f"seed {self.seed}: {shlex.join(self.words)}"
+
+    def _look(self, progress: Progress, seconds: float) -> None:
+        """Take in how far the curve is; a file that is just being written may not be read."""
+        try:
+            found = self._points()
+        except FileError:
+            return
+        every = self.file.protocol.interactions
+        self._require_begun(found)
+        epoch = min(int(found.steps[-1]) // every, self.epochs)
+        if epoch > progress.epoch:
+            progress.epoch_seconds = seconds / epoch
+            progress.finished_epoch(epoch, [float(self._scores(found.scores[-1:])[0])], [False])
+
+    def _points(self) -> Points:
+        files = [path for path, status in self._files().items() if status != self._before.get(path)]
+        if not files:
+            raise FileError(
+                f"{self.told} wrote no file that '{self.script.curve}' names in {self.folder}: say where its curve is, "
+                "as in curve=logs/{seed}.csv"
+            )
+        if len({path.parent for path in files}) > 1:
+            raise FileError(
+                f"{self.told} wrote curves of several runs: {listed([str(path) for path in files])}"
+            )
+        return points.read_run(files, self.script.metric)
+
+    def _require_begun(self, found: Points) -> None:
+        every = self.file.protocol.interactions
+        if found.steps[0] > every:
+            raise QrlSuiteError(
+                f"{self.told}: its first score is at step {found.steps[0]}, after the first epoch of {every} steps: "
+                "scores are not carried backward; give a task with longer epochs"
+            )
+
+    def _scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return scores in the unit of the task: fractions of the best one where it has one."""
+        best = 1.0 if self.file.ranking.thresholds is not None else self.file.score.max_return or 1.0
+        scores = round_means(values / best)
+        if self.file.ranking.thresholds is None and not ((scores > -1e-6) & (scores < 1 + 1e-6)).all():
+            raise QrlSuiteError(
+                f"{self.told}: its scores go from {values.min():g} to {values.max():g}, and those of the task from 0 "
+                f"to {best:g}"
+            )
+        return scores
+
+    def curve(self) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Return the scores after each epoch (T,), each the last at or before its end; and from what they are."""
+        found, every = self._points(), self.file.protocol.interactions
+        self._require_begun(found)
+        last, steps = int(found.steps[-1]), every * self.epochs
+        if last < (1 - REST) * steps:
+            raise QrlSuiteError(
+                f"{self.told}: its curve ends at step {last} of {steps}: nobody knows the scores after it. If a run is "
+                f"shorter, say steps={last // every * every}"
+            )
+        if self.script.kind is None and scripts.kind_of(found.metric) != self.script.scores:
+            raise QrlSuiteError(
+                f"{self.told}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME for what they are"
+            )
+        grid = every * np.arange(1, self.epochs + 1)
+        scores = self._scores(found.scores[np.searchsorted(found.steps, grid, side="right") - 1])
+        origin = {"file": printable(found.source), "points": len(found.steps), "last_step": last}
+        return scores, {**origin, "command": shlex.join(self.words)}
+
+
+def _start(command: list[str], folder: Path, output: IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start a command without a shell, in a session of its own."""
+    libc = ctypes.CDLL(None)
+    try:
+        return subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=(lambda: libc.prctl(*KILL_WITH_PARENT)) if sys.platform == "linux" else None,
+        )
+    except OSError as error:
+        raise QrlSuiteError(
+            f"{command[0]} cannot be started in {folder}: {error.strerror or error}"
+        ) from None
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a command that still runs, with the processes that it started."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        if process.poll() is None:
+            with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
+                os.killpg(process.pid, number)
+                process.wait(PATIENCE)
+
+
+def _store(
+    entry: Entry,
+    store: EntryStore,
+    seed: int,
+    scores: NDArray[np.float64],
+    origin: Mapping[str, Any],
+    cpu: float,
+) -> None:
+    """Put a seed into its place, whole or not at all."""
+    place, record = store.seed(seed).path, store.record()
+    made = SeedStore(place.with_name(f".{place.name}.made"), seed)
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    run = {
+        **({} if entry.study is None else {"plan": entry.study}),
+        "task": record.task_name,
+        "task_hash": record.task_hash,
+        "entry": record.name,
+        "label": record.label,
+        "algorithm": SCRIPT,
+        "algorithm_options": options.plain(entry.script),
+        "model": entry.model.name,
+        "seed": seed,
+        "interactions_per_epoch": entry.task.file.protocol.interactions,
+        "status": "finished",
+        "epochs": len(scores),
+        "code": identity.of(entry).record(),
+        "imported": origin,
+        "agent": False,
+        "provenance": [provenance.collect([]).content],
+    }
+    try:
+        shutil.rmtree(made.path, ignore_errors=True)
+        made.path.mkdir(parents=True)
+        rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(scores, start=1)]
+        write_atomically(made.table, table_bytes(rows))
+        times = {"epoch": len(rows), "cpu": cpu, "host": socket.gethostname(), "time": now}
+        write_atomically(made.timings, json_line(times))
+        made.write_record(RunRecord.model_validate(run))
+        made.path.rename(place)
+    except OSError as error:
+        raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
