@@ -32,6 +32,7 @@ from qrlsuite.errors import FileError, QrlSuiteError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment import script as scripts
 from qrlsuite.experiment.entry import Entry, of_script
+from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task
 from qrlsuite.results import codes, points, provenance
@@ -108,12 +109,13 @@ def train(
     """
     if store.finished([seed], entry.epochs):
         return
-    codes.require(store, identity.of(entry), socket.gethostname())
+    code = identity.of(entry)
+    codes.require(store, code, socket.gethostname())
     run, before = _Run(entry, seed, output), resource.getrusage(resource.RUSAGE_CHILDREN)
     run.follow(progress, report)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    _store(entry, store, seed, *run.curve(), cpu)
+    _store(entry, store, seed, code, *run.curve(), cpu)
 
 
 class _Run:
@@ -226,7 +228,7 @@ class _Run:
             )
         if self.script.kind is None and scripts.kind_of(found.metric) != self.script.scores:
             raise QrlSuiteError(
-                f"{self.told}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME for what they are"
+                f"{self.told}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME"
             )
         grid = every * np.arange(1, self.epochs + 1)
         scores = self._scores(found.scores[np.searchsorted(found.steps, grid, side="right") - 1])
@@ -266,6 +268,7 @@ def _store(
     entry: Entry,
     store: EntryStore,
     seed: int,
+    code: CodeIdentity,
     scores: NDArray[np.float64],
     origin: Mapping[str, Any],
     cpu: float,
@@ -281,13 +284,12 @@ def _store(
         "entry": record.name,
         "label": record.label,
         "algorithm": SCRIPT,
-        "algorithm_options": options.plain(entry.script),
         "model": entry.model.name,
         "seed": seed,
         "interactions_per_epoch": entry.task.file.protocol.interactions,
         "status": "finished",
         "epochs": len(scores),
-        "code": identity.of(entry).record(),
+        "code": code.record(),
         "imported": origin,
         "agent": False,
         "provenance": [provenance.collect([]).content],

@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options, registry, specs
-from qrlsuite.errors import OptionError, PluginError
+from qrlsuite.errors import OptionError, PluginError, UnknownNameError
 from qrlsuite.experiment import source, task
 from qrlsuite.experiment.task import EXTERNAL, Task
 from qrlsuite.options import Setting
@@ -154,7 +154,11 @@ def place(name: str | Task, script: Script) -> tuple[Task, Script]:
     ):
         found = _new_task(name, script)
     else:
-        found = task.load(name)
+        try:
+            found = task.load(name)
+        except UnknownNameError as error:
+            new = "a new one needs steps=N, and maximum=BEST or thresholds=A,B"
+            raise UnknownNameError(f"{error}; {new}") from None
     if given and found.environment.name != EXTERNAL:
         raise OptionError(f"{', '.join(given)}: task '{found.name}' says that itself; leave it out")
     protocol = found.file.protocol

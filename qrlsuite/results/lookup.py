@@ -11,6 +11,7 @@ from typing import Protocol, TypeVar
 from qrlsuite import notation, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed, nearest
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import in_a_file, load
 from qrlsuite.results.store import EntryStore
 
@@ -196,7 +197,9 @@ def _short(entry: Named) -> str:
 
 def _names(entry: Named) -> tuple[str, ...]:
     """Return every name by which an entry can be found."""
-    plain = (entry.name, entry.label, _short(entry), entry.name.rpartition("-")[2])
+    plain = [entry.name, entry.label, _short(entry), entry.name.rpartition("-")[2]]
+    if entry.label.startswith(f"{SCRIPT} "):  # its name was typed, and perhaps no steps
+        plain.append(entry.label.split(" ")[1])
     return (*plain, *(f"{entry.task}/{name}" for name in plain))
 
 

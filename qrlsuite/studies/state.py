@@ -333,7 +333,7 @@ class State(Shown):
         study = self.study
         seeds = f"{TUNING_SEEDS}:{TUNING_SEEDS + study.design.looks[0]}"
         for table, (name, entry) in zip(study.file.entries, study.entries.items()):
-            if self._hours(name, 1) is None:
+            if entry.script is None and self._hours(name, 1) is None:
                 task = str(table.task)
                 alike = resolve(task, entry.label).task.name == entry.task.name
                 label = entry.label if alike else str(table.model)
