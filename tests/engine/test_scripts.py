@@ -222,6 +222,7 @@ reason = "a test"
     assert commands.qrlsuite(*words()).returncode == 0
     begun = {path: path.read_text() for path in walk.glob("starts-*.txt")}
     assert len(begun) == 7
+    assert commands.qrlsuite("export", "walk", "--out", "out").returncode == 0
     store = the_entry(walk / "runs")
     shutil.rmtree(store.seed(0).path)
     shutil.rmtree(next(walk.glob("runs/decisions/walks/*/*/seed-10001")))
@@ -235,7 +236,6 @@ reason = "a test"
     assert "found in a results folder" in commands.qrlsuite("study", "run", "runs/decisions/walks").stderr
     for typed in (
         ["import", "runs", "--runs", "copy"],
-        ["export", "walk", "--out", "out"],
         ["verify", "out", "--rerun", "1"],
         ["leaderboard", "--html", "page.html"],
         ["show", "walks.toml"],
