@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -85,6 +85,17 @@ def parse_entry(text: str) -> Written:
         settings=tuple(each for each in settings if each.side is not None or each.name not in own),
         preset=own.get(PRESET),
         start=own.get(START),
+    )
+
+
+def joined(words: Sequence[str]) -> str:
+    """Return words of a command line as one text; a script's command is one of them, with its white space.
+
+    >>> joined(["script", "ppo-mine", "command=python ppo.py --seed {seed}"])
+    "script ppo-mine command='python ppo.py --seed {seed}'"
+    """
+    return " ".join(
+        write_setting(*word.split("=", 1)) if word.startswith("command=") else word for word in words
     )
 
 

@@ -19,6 +19,7 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.published import PUBLISHED
+from qrlsuite.notation import joined
 from qrlsuite.options import parse_setting
 
 ROOT = Path(__file__).parents[2]
@@ -138,12 +139,12 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
             and not named[flag].endswith(".toml")
             and not ("--published" in words and (PUBLISHED / named[flag]).is_dir())
         ):
-            registry.get(specs.kind(kind), named[flag].split()[0])
+            registry.get(specs.kind(kind), named[flag].split()[0].partition("+")[0])
     if words[0] not in ("run", "tune") or "--task" not in named or "my-" in line or "gym:" in line:
         return
     plain = list(itertools.takewhile(lambda word: not word.startswith("-"), words[1:]))
     settings = [parse_setting(value) for key, value in itertools.pairwise(words) if key == "--set"]
-    entries = plain if words[0] == "tune" else [named.get("--model") or " ".join(plain)]
+    entries = plain if words[0] == "tune" else [named.get("--model") or joined(plain)]
     if entries == [""] and (page, line) in IN_SENTENCES:
         return
     for entry in entries:

@@ -35,7 +35,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import load
-from qrlsuite.notation import Written, parse_entry, split, write_setting
+from qrlsuite.notation import Written, joined, parse_entry, split, write_setting
 
 QUICK_QUBITS = 4
 
@@ -176,9 +176,7 @@ def _written(words: list[str], model: str | None, settings: list[str], quick: bo
     if not words or model is not None:
         problem = f"'{' '.join(words)}' and --model {model}: give one of them" if words else "name a model"
         raise OptionError(f"{problem}, for example: qrlsuite run mlp width=16 --task beam6g")
-    # a script's command is one word of the shell
-    words = [write_setting(*word.split("=", 1)) if word.startswith("command=") else word for word in words]
-    written = parse_entry(" ".join(words)).given(settings=tuple(map(options.parse_setting, settings)))
+    written = parse_entry(joined(words)).given(settings=tuple(map(options.parse_setting, settings)))
     if not quick or any(setting.name == "qubits" for setting in written.settings):
         return written
     ansatzes = registry.load().of(specs.AnsatzSpec)
