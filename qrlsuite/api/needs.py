@@ -11,7 +11,6 @@ from typing import Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from qrlsuite.api.arguments import several
 from qrlsuite.api.entries import load
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
@@ -82,8 +81,8 @@ class SeedsNeeded(Shown):
 
 
 def power(
-    first: str,
-    second: str | None = None,
+    first: str | EntryResults,
+    second: str | EntryResults | None = None,
     *,
     task: str | None = None,
     draws: int = 200,
@@ -99,7 +98,7 @@ def power(
     Parameters
     ----------
     first, second:
-        Entries with two seeds or more.
+        Entries with two seeds or more: arguments of `load`, or its results.
     task, runs, published:
         As for `load`.
     draws:
@@ -112,8 +111,11 @@ def power(
     OptionError
         If an entry has a single seed, no seed of the first reached a threshold, or they are of different tasks.
     """
-    names = several(first) if second is None else (first, second)
-    entries = [load(name, task=task, runs=runs, published=published) for name in names]
+    given = (first,) if second is None else (first, second)
+    entries = [
+        each if isinstance(each, EntryResults) else load(each, task=task, runs=runs, published=published)
+        for each in given
+    ]
     for entry in entries:
         if len(entry.seeds) < 2:
             raise OptionError(f"'{entry.label}' has a single seed, which has no spread: train two or more")

@@ -525,6 +525,17 @@ def test_a_folder_of_other_programs_is_answered_with_what_to_type(
     assert said in refused("import", logs, *options)
 
 
+def test_seeds_are_planned_like_those_of_a_file(
+    qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path
+) -> None:
+    words = ("power", "--like", csv, "maximum=100", "--draws", 20)
+    assert "external slow lr=0.01 against external fast lr=0.1: 1" in qrlsuite(*words).stdout
+    assert "against" not in qrlsuite(*words, "fast").stdout
+    assert not (tmp_path / "runs").exists(), "nothing is imported"
+    assert "'external' is a new task: say what a good score is" in refused("power", "--like", csv)
+    assert "power of which entries? name one or two" in refused("power")
+
+
 def test_names_of_one_s_own_are_shown_as_they_are(
     qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path
 ) -> None:

@@ -55,7 +55,10 @@ def import_entries(
 
     Examples: qrlsuite import /mnt/cluster/runs; qrlsuite import curves.csv maximum=500
     """
-    paths, options = _divide(words)
+    names, options = divide(words)
+    paths = [Path(name) for name in names]
+    if not paths:
+        raise OptionError("import what? give a folder or files: qrlsuite import curves.csv maximum=500")
     files = [path for path in paths if not path.is_dir()]
     given = [*(["--task"] if task is not None else []), *options]
     if files and len(files) < len(paths):
@@ -93,19 +96,17 @@ def _taken(folder: Path, runs: Path) -> Iterator[Imported]:
         yield from (import_seeds.import_seeds(source, runs) for source in import_seeds.sources(folder))
 
 
-def _divide(words: Sequence[str]) -> tuple[list[Path], dict[str, Any]]:
-    """Divide words into paths and options; a path may have a `=` in it, too."""
+def divide(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """Divide words into names and options; a path or an entry may have a `=` in it, too."""
     options: dict[str, Any] = {}
-    paths = []
+    names = []
     for word in words:
         name, equals, text = word.partition("=")
         if equals and name in OPTIONS:
             options[name] = _value(word, text, OPTIONS[name])
         else:
-            paths.append(Path(word))
-    if not paths:
-        raise OptionError("import what? give a folder or files: qrlsuite import curves.csv maximum=500")
-    return paths, options
+            names.append(word)
+    return names, options
 
 
 def _value(word: str, text: str, kind: Callable[[str], Any]) -> Any:

@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from qrlsuite import api
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption, entries_here
+from qrlsuite.cli.commands.import_ import divide
 from qrlsuite.engine.terminal import table_console
+from qrlsuite.errors import OptionError
 
 
 def power(
-    first: Annotated[
-        str,
+    words: Annotated[
+        list[str] | None,
         typer.Argument(
-            metavar="ENTRY",
-            help="An entry like those to compare, with two seeds or more.",
+            metavar="ENTRY [ENTRY]",
+            help="An entry like those to compare, with two seeds or more; and another one, to be told apart from it. "
+            "With --like also options of `import`, such as maximum=500.",
             autocompletion=entries_here,
         ),
-    ],
-    second: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[ENTRY]",
-            help="Another one, to be told apart from the first.",
-            autocompletion=entries_here,
+    ] = None,
+    like: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--like",
+            metavar="FILE",
+            help="Look for ENTRY in this file of curves, see `import`; default: all of its entries. Repeatable.",
         ),
     ] = None,
     task: AmongOption = None,
@@ -44,10 +48,21 @@ def power(
     curves and judged by rule `times` at alpha = .05: all seeds at once, and with looks, as
     `qrlsuite study new` writes them.
 
-    Example: qrlsuite power "mlp width=64" --task beam6g --published
+    Examples: qrlsuite power "mlp width=64" --task beam6g --published; qrlsuite power --like results.csv maximum=500
     """
+    if like:
+        names, options = divide(words or ())
+        with tempfile.TemporaryDirectory() as folder:
+            done = api.import_curves(like, task=task, runs=folder, **options)
+            entries: list[Any] = [
+                api.load(name, runs=folder) for name in names or [each.label for each in done]
+            ]
+    else:
+        entries = list(words or ())
+    if not 1 <= len(entries) <= 2:
+        raise OptionError("power of which entries? name one or two: qrlsuite power 'mlp width=64'")
     found = api.power(
-        first, second, task=task, draws=draws, runs=runs, published=published, progress=not json_output
+        *entries, task=task, draws=draws, runs=runs, published=published, progress=not json_output
     )
     if json_output:
         typer.echo(json.dumps(found.as_dict()))
