@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from qrlsuite import notation, registry, specs
+from qrlsuite import notation, options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed, nearest
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.script import SCRIPT
@@ -176,13 +176,23 @@ def _same(written: notation.Written, label: str) -> bool:
         known = notation.parse_entry(label.partition(" @")[0])
     except OptionError:  # of a folder that is damaged
         return False
-    options = ({each.full_name: each.value for each in one.settings} for one in (written, known))
+    typed, shown = ({each.full_name: each.value for each in one.settings} for one in (written, known))
+    if written.model == known.model and known.settings and _first_is_default(known):
+        typed = {known.settings[0].full_name: known.settings[0].value, **typed}
     return (
         written.algorithm in (None, known.algorithm)
         and written.model == known.model
         and written.start == known.start
-        and next(options) == next(options)
+        and typed == shown
     )
+
+
+def _first_is_default(known: notation.Written) -> bool:
+    """Return whether a label's first option, which it always has, may have been left out where it was typed."""
+    models, first = registry.load().of(specs.ModelSpec), known.settings[0]
+    if known.model not in models:
+        return True
+    return options.plain(specs.resolve(models[known.model].spec.options)()).get(first.name) == first.value
 
 
 def mentions(entry: Named, word: str) -> bool:

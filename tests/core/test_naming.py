@@ -58,6 +58,15 @@ def test_an_entry_answers_to_what_run_was_given() -> None:
     assert typed not in entry.label
     known = [Entry(entry.label, "cartpole", entry.name), *SEVERAL]
     assert lookup.choose(known, typed, "runs") is known[0]
+
+
+def test_a_default_that_was_not_typed_is_not_needed_where_the_plugin_is_gone() -> None:
+    known = [
+        Entry(f"my-ppo mlp width={width} norm=none", "beam6g", f"my-ppo-mlp-{width}") for width in (16, 64)
+    ]
+    assert lookup.choose(known, "my-ppo mlp norm=none", "runs") is known[1]
+    with pytest.raises(UnknownNameError, match=r"(no entry|begins with) .my-ppo mlp norm=x"):
+        lookup.choose(known, "my-ppo mlp norm=x", "runs")
     with pytest.raises(UnknownNameError, match="no entry"):
         lookup.choose(known, "mlp lr=0.02", "runs")
 
