@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import circuit, registry, specs
-from qrlsuite.circuit import drawing, export
+from qrlsuite.circuit import drawing, export, lightcone
 from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
@@ -131,7 +131,8 @@ def _ansatz(
     if "name" in settings:
         raise OptionError(f"ansatz '{name}': name: no option of that name")
     size = registry.get(specs.AnsatzSpec, name).size
-    drawn = circuit.ansatz(name, **{"qubits": 4, "layers": 2, **size, **settings})
+    sizes = {"qubits": 4, "layers": 2, **size, **settings}
+    drawn = circuit.ansatz(name, **sizes)
     if code:
         return {"circuit text": canonical(drawn), **identity.of_registered(specs.AnsatzSpec, name, drawn)}
     if format is not None:
@@ -143,6 +144,9 @@ def _ansatz(
             rank = jacobian_rank(drawn)
             text = f"not computed where gates connect more than {LARGEST_RANK} qubits"
             content["resources"]["jacobian_rank"] = text if rank is None else rank
+    numbers = (1,) if size else range(1, drawn.qubits + 3)
+    deeper = ((layers, circuit.ansatz(name, **{**sizes, "layers": layers})) for layers in numbers)
+    content["light_cone"] = lightcone.described(drawn, deeper)
     if out is not None:
         write_atomically(out, pictures.encode(drawing.draw_figure(drawn), picture_format))
         content["figure"] = str(out)

@@ -6,7 +6,7 @@ Importing this package imports numpy and nothing heavier; registry, torch and si
 from __future__ import annotations
 
 from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend, expectations, options_on
-from qrlsuite.circuit.description import GATES, Angle, Circuit, Element, Operation, Outcome, Parameter
+from qrlsuite.circuit.description import GATES, Angle, Circuit, Element, Operation, Parameter
 from qrlsuite.circuit.executions import ExecutionCounter
 from qrlsuite.circuit.model import CircuitModel
 
@@ -19,7 +19,6 @@ __all__ = [
     "Element",
     "ExecutionCounter",
     "Operation",
-    "Outcome",
     "Parameter",
     "ansatz",
     "create_backend",

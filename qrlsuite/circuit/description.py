@@ -10,9 +10,6 @@ write, such as `np.arctan(circuit.input(0))`, or a number. Reading order is appl
 significant bit of a basis state's index, as in PennyLane. The measured observables are Pauli Z on chosen qubits
 (default: every), or products of Pauli X, Y and Z.
 
-A qubit may be measured before the end, its outcome may control later gates, and a qubit may be reset. This is written
-with its measurement deferred to the end (Nielsen & Chuang 2010, section 4.4), so that every backend runs it.
-
 With `mean_field` the same description stands for a classical approximation, see `Circuit`.
 
 An ansatz is a function that writes such a circuit:
@@ -112,15 +109,8 @@ Observable = int | tuple[int, ...] | str
 """A qubit for its Pauli Z, qubits for the product of theirs, or a product of other Paulis: `X0 Y2`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The result of `Circuit.measure_mid`, 0 or 1: a control of later gates, or an observable (1 or -1)."""
-
-    number: int
-
-
-Word = tuple[tuple[str, int | Outcome], ...]
-"""The Paulis of an observable, and the qubits or outcomes they are of."""
+Word = tuple[tuple[str, int], ...]
+"""The Paulis of an observable, and their qubits."""
 
 _FACTOR = re.compile(r"\s*([XYZ])(\d+)\s*")
 
@@ -321,13 +311,6 @@ class Angle:
         terms = (each for each in (self.input, self.factor) if each is not None)
         return set().union(*(each.inputs if isinstance(each, Encoding) else {each} for each in terms))
 
-    @property
-    def functions(self) -> set[str]:
-        """The functions of inputs in it."""
-        terms = [each for each in (self.input, self.factor) if isinstance(each, Encoding)]
-        inner = (part.functions for each in terms for part in each.of)
-        return {each.function for each in terms}.union(*inner)
-
     def on(self, place: Mapping[int | Encoding | None, int]) -> Angle:
         """Return the angle with inputs in the places of its functions of inputs."""
         if not (isinstance(self.input, Encoding) or isinstance(self.factor, Encoding)):
@@ -357,6 +340,10 @@ class Parameter:
     def size(self) -> int:
         """Number of scalars."""
         return math.prod(self.shape)
+
+    def written(self, index: int) -> str:
+        """Return a scalar, by its index in the flattened array, as its author writes it: `weights[1, 2]`."""
+        return f"{self.name}{[int(i) for i in np.unravel_index(index, self.shape)]}"
 
     def __getitem__(self, index: int | tuple[int, ...]) -> Angle:
         """Return the scalar at a full multi-index as an angle."""
@@ -403,7 +390,7 @@ class Circuit:
     qubits:
         Number of qubits, with those that stand for earlier measurements and resets.
     deferred:
-        How many of them do, the last ones: one for every measured qubit that is used again, and one for every reset.
+        How many of them do, the last ones (deferred measurement: Nielsen & Chuang 2010, section 4.4).
 
     Raises
     ------
@@ -423,9 +410,6 @@ class Circuit:
         self.parameters: dict[str, Parameter] = {}
         self._operations: list[Operation] = []
         self._words: tuple[Word, ...] = tuple((("Z", q),) for q in range(qubits))
-        self._wires = list(range(qubits))  # of every qubit: resets move it
-        self._outcomes: list[int] = []  # of every outcome the wire that has it
-        self._measured: set[int] = set()  # wires with outcomes that nothing has acted on since
 
     @property
     def operations(self) -> tuple[Operation, ...]:
@@ -435,12 +419,12 @@ class Circuit:
     @property
     def observables(self) -> tuple[Observable, ...]:
         """The observables in output order, as arguments of `measure`."""
-        return tuple(map(_observable, self._resolved()))
+        return tuple(map(_observable, self._words))
 
     @property
     def measured(self) -> tuple[tuple[int, ...], ...]:
         """The qubits of every observable, in output order: it is the product of their Paulis, see `axes`."""
-        return tuple(tuple(wire for _, wire in word) for word in self._resolved())
+        return tuple(tuple(wire for _, wire in word) for word in self._words)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -457,100 +441,18 @@ class Circuit:
         """Whether every observable is a Pauli Z, or a product of Pauli Z, as backends need it."""
         return all(set(axes) == {"Z"} for axes in self.axes)
 
-    def _resolved(self) -> list[tuple[tuple[str, int], ...]]:
-        return [tuple((axis, self._wire(of)) for axis, of in word) for word in self._words]
+    def _has(self, qubit: Any) -> bool:
+        return isinstance(qubit, int | np.integer) and 0 <= int(qubit) < self.qubits
 
-    def _wire(self, of: int | Outcome) -> int:
-        return self._outcomes[of.number] if isinstance(of, Outcome) else self._wires[of]
-
-    def _has(self, of: Any) -> bool:
-        """Return whether this is a qubit, or an outcome, of the circuit."""
-        if isinstance(of, Outcome):
-            return of.number < len(self._outcomes)
-        return isinstance(of, int | np.integer) and 0 <= int(of) < len(self._wires)
-
-    def measure_mid(self, qubit: int, postselect: None = None) -> Outcome:
-        """Measure a qubit now, and go on.
-
-        The measurement is deferred to the end: if the qubit is used again, a CNOT copies the outcome to a further qubit
-        first.
-
-        Parameters
-        ----------
-        qubit:
-            Which.
-        postselect:
-            Refused: of the runs that end otherwise there would be no result.
-
-        Returns
-        -------
-        Outcome
-            The result. `append("X", 1, control=outcome)` applies a gate if it is 1, `measure([outcome])` measures it.
-
-        Raises
-        ------
-        CircuitError
-            If there is no such qubit, or for postselection.
-        """
-        if postselect is not None:
-            raise CircuitError(
-                f"postselect = {postselect!r}: no run may be thrown away, as a result is needed for every input; let "
-                "the outcome control gates"
-            )
-        wire = self._used(qubit, "measure_mid")
-        if wire in self._measured:  # again: what was found
-            return Outcome(self._outcomes.index(wire))
-        self._outcomes.append(wire)
-        self._measured.add(wire)
-        self._keep_for(self._words)
-        return Outcome(len(self._outcomes) - 1)
-
-    def reset(self, qubit: int) -> None:
-        """Put a qubit back into 0, whatever it is in: a further qubit takes its place if gates have acted on it.
-
-        Raises
-        ------
-        CircuitError
-            If there is no such qubit.
-        """
-        wire = self._used(qubit, "reset")
-        if any(wire in operation.qubits for operation in self._operations):
-            self._measured.discard(wire)
-            self._wires[qubit] = self._further()
-
-    def _used(self, qubit: int, what: str) -> int:
-        """Return the wire of a qubit."""
-        if not isinstance(qubit, int) or not self._has(qubit):
-            raise CircuitError(f"{what}({qubit!r}): this circuit has qubits 0..{len(self._wires) - 1}")
-        return self._wires[qubit]
-
-    def _further(self) -> int:
-        """Add a qubit for something deferred."""
-        self.qubits += 1
-        self.deferred += 1
-        return self.qubits - 1
-
-    def _keep(self, wires: Iterable[int]) -> None:
-        """Copy outcomes from wires that are used again to further ones."""
-        for wire in self._measured.intersection(wires):
-            copied = self._further()
-            self._operations.append(Operation("CNOT", (wire, copied)))
-            self._outcomes = [copied if each == wire else each for each in self._outcomes]
-            self._measured.remove(wire)
-
-    def _keep_for(self, words: Iterable[Word]) -> None:
-        """Copy outcomes from wires whose observables are another Pauli than Z."""
-        self._keep(self._wire(of) for word in words for axis, of in word if axis != "Z")
-
-    def measure(self, observables: Sequence[int | Outcome | Sequence[int | Outcome] | str]) -> None:
+    def measure(self, observables: Sequence[int | Sequence[int] | str]) -> None:
         """Measure these observables, in this order, instead of Pauli Z on every qubit.
 
         Parameters
         ----------
         observables:
-            A qubit or an outcome stands for its Pauli Z, several for the product of their Pauli Z, and a text for any
-            product of Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. Observables without a
-            common basis are executed apart, see `in_bases`.
+            A qubit stands for its Pauli Z, several for the product of their Pauli Z, and a text for any product of
+            Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. Observables without a common
+            basis are executed apart, see `in_bases`.
 
         Raises
         ------
@@ -571,14 +473,10 @@ class Circuit:
             )
         ):
             raise CircuitError(
-                f"observables {observables!r}: distinct qubits 0..{len(self._wires) - 1}, distinct groups of them, or "
+                f"observables {observables!r}: distinct qubits 0..{self.qubits - 1}, distinct groups of them, or "
                 'products like "X0 Y1" are needed'
             )
         self._words = tuple(listed)
-        self._keep_for(listed)
-        if any(isinstance(of, Outcome) for word in listed for _, of in word):
-            # Not the qubit's own wire: it may be an observable, too.
-            self._keep(self._wire(of) for word in listed for _, of in word if isinstance(of, Outcome))
 
     def input(self, index: int) -> Angle:
         """Return input feature `index` as an angle (radians)."""
@@ -604,7 +502,7 @@ class Circuit:
         gate: str,
         wires: int | Sequence[int],
         *angles: Angle | float,
-        control: int | Outcome | None = None,
+        control: int | None = None,
     ) -> None:
         """Add a gate.
 
@@ -617,7 +515,7 @@ class Circuit:
         angles:
             As many as the gate takes, in radians.
         control:
-            Apply the gate, which is on one qubit, only if this qubit, or this outcome of `measure_mid`, is 1.
+            Apply the gate, which is on one qubit, only if this qubit is 1.
         """
         if gate in ISING:
             self._append_ising(gate, wires, angles, control)
@@ -627,7 +525,7 @@ class Circuit:
             known = f"; write it as {hint}" if hint else nearest(gate, [*GATES, *ISING])
             raise CircuitError(f"unknown gate '{gate}'{known}")
         signature = GATES[gate]
-        targets = (wires,) if isinstance(wires, int | Outcome) else tuple(wires)
+        targets = (wires,) if isinstance(wires, int) else tuple(wires)
         if control is not None and not signature.controllable and signature.wires > 1:
             raise CircuitError(
                 f"{gate} takes no extra control; use CNOT or CZ, or a controlled gate on one qubit"
@@ -637,30 +535,25 @@ class Circuit:
             raise CircuitError(
                 f"{gate} needs {signature.wires} distinct qubit{'s' * (signature.wires > 1)}, got {touched}"
             )
-        if not all(map(self._has, touched)) or any(isinstance(w, Outcome) for w in targets):
-            raise CircuitError(
-                f"{gate} on qubits {touched}: this circuit has qubits 0..{len(self._wires) - 1}"
-            )
+        if not all(map(self._has, touched)):
+            raise CircuitError(f"{gate} on qubits {touched}: this circuit has qubits 0..{self.qubits - 1}")
         if len(angles) != signature.angles:
             raise CircuitError(f"{gate} takes {signature.angles} angle(s), got {len(angles)}")
         exact = tuple(a if isinstance(a, Angle) else Angle(constant=float(a)) for a in angles)
         for angle in exact:
             self._check(angle)
-        self._keep(self._wires[w] for w in touched if not isinstance(w, Outcome))
-        on = tuple(self._wires[w] for w in targets)
-        by = None if control is None else self._wire(control)
-        if by is not None and gate in ("X", "Z"):
-            gate, on, by = "CNOT" if gate == "X" else "CZ", (by, *on), None
-        elif by is not None and gate in CONTROLLED:
+        if control is not None and gate in ("X", "Z"):
+            gate, targets, control = "CNOT" if gate == "X" else "CZ", (control, *targets), None
+        elif control is not None and gate in CONTROLLED:
             gate, exact = "U3", tuple(Angle(constant=number) for number in CONTROLLED[gate])
-        self._operations.append(Operation(gate, on, exact, by))
+        self._operations.append(Operation(gate, targets, exact, control))
 
     def _append_ising(
         self,
         gate: str,
         wires: int | Sequence[int],
         angles: Sequence[Angle | float],
-        control: int | Outcome | None,
+        control: int | None,
     ) -> None:
         pair = (wires,) if isinstance(wires, int) else tuple(wires)
         if len(pair) != 2 or len(angles) != 1 or control is not None:
@@ -727,11 +620,6 @@ class Circuit:
         return len(self._operations)
 
     @property
-    def functions(self) -> set[str]:
-        """The functions of inputs that its angles have: `FUNCTIONS`, `sum`, `product`."""
-        return {name for operation in self for angle in operation.angles for name in angle.functions}
-
-    @property
     def parameter_count(self) -> int:
         """Number of trainable scalars."""
         return sum(p.size for p in self.parameters.values())
@@ -742,14 +630,14 @@ class Circuit:
 
 
 def _factors(observable: Any) -> Word:
-    """Return the Paulis of an observable with their qubits or outcomes; empty if it is no observable."""
+    """Return the Paulis of an observable with their qubits; empty if it is no observable."""
     if isinstance(observable, str):
         found = [_FACTOR.fullmatch(part) for part in re.split(r"[*@]|(?<=\d)\s+(?=[XYZ])", observable)]
         return tuple((each[1], int(each[2])) for each in found if each) if all(found) else ()
     qubits = tuple(observable) if isinstance(observable, Iterable) else (observable,)
-    if not all(isinstance(q, Outcome | int | np.integer) for q in qubits):
-        return ()
-    return tuple(("Z", q if isinstance(q, Outcome) else int(q)) for q in qubits)
+    return (
+        tuple(("Z", int(q)) for q in qubits) if all(isinstance(q, int | np.integer) for q in qubits) else ()
+    )
 
 
 def _observable(word: tuple[tuple[str, int], ...]) -> Observable:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import inspect
 import linecache
-import math
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.circuit.description import FUNCTIONS, Angle, Circuit, Parameter
+from qrlsuite.circuit.description import FUNCTIONS, Angle, Circuit
 from qrlsuite.errors import CircuitError, OptionError, QrlSuiteError
 from qrlsuite.shortforms import SHAPES, has_one_size, shapes_of, source_of
 
@@ -32,7 +31,8 @@ MORE_INPUTS = 9
 
 GATES: dict[str, tuple[str, bool]] = {
     **{name: (name, False) for name in ("RX", "RY", "RZ", "Rot", "U3", "S", "T", "CNOT", "CZ", "SWAP")},
-    **{f"C{name}": (name, True) for name in ("RX", "RY", "RZ", "Rot", "(U3)", "(S)", "(T)", "Y", "H")},
+    **{f"C{name}": (name, True) for name in ("RX", "RY", "RZ", "Rot", "Y", "H")},
+    **{f"C({name})": (name, True) for name in ("U3", "S", "T")},
     **{f"Ising{axis}": (f"R{axis}", False) for axis in ("XX", "YY", "ZZ")},
     **{f"Pauli{axis}": (axis, False) for axis in "XYZ"},
     "Hadamard": ("H", False),
@@ -42,6 +42,11 @@ GATES: dict[str, tuple[str, bool]] = {
 
 PHASES = ("Identity", "GlobalPhase", "Barrier", "Snapshot")
 """Operators that change no expectation value."""
+
+SYMBOLS = (
+    "while a circuit is read, inputs and weights are arrays of symbols for one sample: add and multiply them, use "
+    f"numpy's {', '.join(FUNCTIONS)} of inputs, and let no gate or shape depend on a value"
+)
 
 
 def trace(
@@ -71,55 +76,69 @@ def trace(
     CircuitError
         For an angle, gate or measurement that a `Circuit` cannot have.
     """
-    name = source_of(function).__name__
-    shapes = shapes_of(function)
+    import pennylane as qml
+
+    source = source_of(function)
+    name = source.__name__
+    draft = Circuit(1, MOST_INPUTS)
+    weights = {
+        each: _array(draft, each, _shape(shape, qubits, layers))
+        for each, shape in shapes_of(function).items()
+    }
     if has_one_size(function) and layers != 1:
         raise OptionError(
             f"layers = {layers}: the layers of '{name}' are in the numbers of {SHAPES}: set layers=1, or write there "
             "a function of qubits and layers"
         )
-    wires = list(getattr(getattr(function, "device", None), "wires", None) or ())
-    size = {"qubits": qubits, "n_wires": qubits, "layers": layers, "n_layers": layers}
-    draft = Circuit(1, MOST_INPUTS)
-    weights: dict[str, Any] = {}
-    for each, shape in shapes.items():
-        numbers = (
-            shape(**{k: size[k] for k in inspect.signature(shape).parameters if k in size})
-            if callable(shape)
-            else shape
-        )
-        whole = tuple(numbers) if isinstance(numbers, Iterable) else () if numbers == 1 else (numbers,)
-        weights[each] = _array(draft.parameter(each, tuple(map(int, whole)) or (1,)), whole)
-    count = qubits or len(wires) or 1
-    operations, results = _run(call or source_of(function), source_of(function), draft, count, weights)
+    labels = list(getattr(getattr(function, "device", None), "wires", None) or ())
+    tape, results, lines = _run(call or source, source, draft, qubits or len(labels) or 1, weights)
     words = [_word(each, name) for each in results]
-    used = {wire for operation, _ in operations for wire in operation.wires}.union(*words)
-    labels = wires or (
-        list(range(max(used) + 1)) if all(isinstance(wire, int) for wire in used) else sorted(used)
-    )
+    used = set(tape.wires).union(*words)
+    if not labels:
+        numbered = all(isinstance(wire, int) for wire in used)
+        labels = list(range(max(used, default=0) + 1)) if numbered else sorted(used)
     if strange := used.difference(labels):
         raise CircuitError(
             f"'{name}' uses the wire {min(strange, key=str)!r}, which its device does not have"
         )
     if qubits not in (None, len(labels)):
         raise OptionError(f"qubits = {qubits}: '{name}' has {len(labels)} wires: set qubits={len(labels)}")
-    circuit = Circuit(len(labels), MOST_INPUTS, mean_field)
-    circuit.parameters = draft.parameters
-    place = {label: k for k, label in enumerate(labels)}
-    for operation, line in operations:
+    measured = [each for each in tape.operations if each.name == "MidMeasureMP"]
+    if chosen := [lines.get(id(each), "") for each in measured if each.postselect is not None]:
+        raise CircuitError(f"postselect: no run may be thrown away, as every input needs a result{chosen[0]}")
+    if measured:
+        (tape,), _ = qml.defer_measurements(tape)
+    deferred = [wire for wire in tape.wires if wire not in used]
+    circuit = Circuit(len(labels) + len(deferred), MOST_INPUTS, mean_field)
+    circuit.deferred, circuit.parameters = len(deferred), draft.parameters
+    place = {wire: k for k, wire in enumerate([*labels, *deferred])}
+    for operation in tape.operations:
         try:
-            _append(circuit, operation, place)
-        except QrlSuiteError as error:
-            raise CircuitError(f"{error}{line}") from None
-    circuit.inputs = 1 + max(
-        (k for operation in circuit for a in operation.angles for k in a.inputs), default=0
-    )
+            for part in _elementary(operation):
+                _append(circuit, part, place)
+        except Exception as error:
+            advice = "" if isinstance(error, QrlSuiteError) else "; write it with rotations, CNOT and CZ"
+            reason = f"{operation.name} cannot be taken: {' '.join(str(error).split())}{advice}"
+            raise CircuitError(reason + lines.get(id(operation), "")) from error
+    features = {k for operation in circuit for angle in operation.angles for k in angle.inputs}
+    circuit.inputs = max(features, default=0) + 1
     circuit.measure([" ".join(f"{axis}{place[wire]}" for wire, axis in word.items()) for word in words])
     return circuit
 
 
-def _array(parameter: Parameter, shape: tuple[int, ...]) -> Any:
-    """Return a parameter's angles as an array of numpy; a single one for the shape ()."""
+def _shape(shape: Any, qubits: int | None, layers: int) -> tuple[int, ...]:
+    """Return a shape as PennyLane's TorchLayer reads it, or that of its function for a size."""
+    if callable(shape):
+        size = {"qubits": qubits, "n_wires": qubits, "layers": layers, "n_layers": layers}
+        shape = shape(**{name: size[name] for name in inspect.signature(shape).parameters if name in size})
+    if isinstance(shape, int):
+        return () if shape == 1 else (shape,)
+    return tuple(map(int, shape))
+
+
+def _array(draft: Circuit, name: str, shape: tuple[int, ...]) -> Any:
+    """Declare a parameter, and return its angles as an array of numpy; a single one for the shape ()."""
+    parameter = draft.parameter(name, shape or (1,))
     if not shape:
         return parameter[0]
     angles = np.empty(shape, dtype=object)
@@ -128,23 +147,15 @@ def _array(parameter: Parameter, shape: tuple[int, ...]) -> Any:
     return angles
 
 
-def _line(file: str, frames: Iterable[tuple[Any, int]]) -> str:
-    """Return the innermost line of a file among frames, for the end of a message; empty where there is none."""
-    number = next((line for frame, line in frames if frame.f_code.co_filename == file), None)
-    text = "" if number is None else linecache.getline(file, number).strip()
-    return f" ({Path(file).name}, line {number}: {text})" if text else ""
-
-
 def _run(
     call: Callable[..., Any], source: Any, draft: Circuit, count: int, weights: Mapping[str, Any]
-) -> tuple[list[tuple[Any, str]], list[Any]]:
-    """Return PennyLane's elementary operators with the line of each, and the measurements that a function returns.
+) -> tuple[Any, list[Any], dict[int, str]]:
+    """Return the tape of a function, the measurements that it returns, and the line of each operator by its id.
 
     A function of more inputs than `count` gets as many as it asks for.
     """
     import autoray  # type: ignore[import-untyped]
     import pennylane as qml
-    from pennylane.devices.preprocess import decompose
 
     autoray.register_backend(Angle, "numpy")
     file = source.__code__.co_filename
@@ -155,85 +166,63 @@ def _run(
             super().append(obj, **kwargs)
             lines[id(obj)] = _line(file, traceback.walk_stack(None))
 
-    failure: Exception | None = None
+    failures: list[Exception] = []
     for inputs in range(count, count + MORE_INPUTS):
         try:
             with Queue() as queue:
                 result = call(np.array([draft.input(k) for k in range(inputs)], dtype=object), **weights)
-            break
         except Exception as error:
-            failure = failure or error
-            if not (isinstance(error, IndexError) and "out of bounds" in str(error)):
-                cause = failure if isinstance(error, ValueError) else error  # of too many inputs, maybe
-                raise _refusal(cause, file) from cause
-    else:
-        assert failure is not None
-        raise _refusal(failure, file) from failure
-    operations: list[tuple[Any, str]] = []
-    for operation in qml.tape.QuantumScript.from_queue(queue).operations:
-        line = lines.get(id(operation), "")
-        name = operation.name
-        if name.startswith(("MidMeasure", "Conditional")):
-            raise CircuitError(
-                f"{name}: a measurement within the circuit; write this circuit gate by gate, with `measure_mid` of "
-                f"qrlsuite.circuit.Circuit{line}"
-            )
-        script = qml.tape.QuantumScript([operation])
-        try:
-            (parts,), _ = decompose(
-                script, lambda each: each.name in _KNOWN, skip_initial_state_prep=False, name="a circuit"
-            )
-        except Exception as error:
-            reason = " ".join(str(error).split())
-            advice = "" if isinstance(error, QrlSuiteError) else "; write it with rotations, CNOT and CZ"
-            raise CircuitError(
-                f"{name} cannot be written with elementary gates: {reason}{advice}{line}"
-            ) from error
-        operations += [(each, line) for each in parts.operations if each.name not in PHASES]
-    results = list(result.values()) if isinstance(result, Mapping) else result
-    return operations, list(np.ravel(results)) if isinstance(results, np.ndarray) else list(
-        results if isinstance(results, list | tuple) else [results]
-    )
+            failures.append(error)
+            if not _asks_for_more(error):
+                break
+        else:
+            listed = list(result.values()) if isinstance(result, Mapping) else result
+            listed = listed if isinstance(listed, list | tuple | np.ndarray) else [listed]
+            return qml.tape.QuantumScript.from_queue(queue), list(listed), lines
+    # the last one is of too many inputs, maybe
+    cause = failures[0 if isinstance(failures[-1], ValueError) or _asks_for_more(failures[-1]) else -1]
+    where = _line(file, reversed(list(traceback.walk_tb(cause.__traceback__))))
+    if _asks_for_more(cause):
+        raise OptionError(f"there is no circuit of this size: {cause}{where}") from cause
+    advice = "" if isinstance(cause, QrlSuiteError) else f"; {SYMBOLS}"
+    raise CircuitError(f"{cause}{advice}{where}") from cause
 
 
-_SYMBOLS = (
-    "while a circuit is read, inputs and weights are arrays of symbols for one sample: add and multiply them, use "
-    f"numpy's {', '.join(FUNCTIONS)} of inputs, and let no gate or shape depend on a value"
-)
+def _asks_for_more(error: Exception) -> bool:
+    return isinstance(error, IndexError) and "out of bounds" in str(error)
 
 
-def _refusal(error: Exception, file: str) -> OptionError:
-    """Return the error of a quantum function in words, with its line."""
-    where = _line(file, reversed(list(traceback.walk_tb(error.__traceback__))))
-    if isinstance(error, QrlSuiteError):
-        return CircuitError(f"{error}{where}")
-    if isinstance(error, IndexError) and "out of bounds" in str(error):
-        return OptionError(f"there is no circuit of this size: {error}{where}")
-    return CircuitError(f"{error}; {_SYMBOLS}{where}")
+def _line(file: str, frames: Iterable[tuple[Any, int]]) -> str:
+    """Return the innermost line of a file among frames, for the end of a message; empty where there is none."""
+    number = next((line for frame, line in frames if frame.f_code.co_filename == file), 0)
+    text = linecache.getline(file, number).strip()
+    return f" ({Path(file).name}, line {number}: {text})" if text else ""
 
 
-_FIXED = {"Adjoint(S)": ("RZ", (-math.pi / 2,)), "Adjoint(T)": ("RZ", (-math.pi / 4,))}
-_KNOWN = {*GATES, *PHASES, *_FIXED, "ControlledPhaseShift"}
+def _elementary(operation: Any) -> list[Any]:
+    """Return PennyLane's own decomposition of an operator."""
+    import pennylane as qml
+    from pennylane.devices.preprocess import decompose
+
+    known = {*GATES, *PHASES, "ControlledPhaseShift", "Adjoint(S)", "Adjoint(T)"}
+    script = qml.tape.QuantumScript([operation])
+    (parts,), _ = decompose(script, lambda each: each.name in known, skip_initial_state_prep=False)
+    return [each for each in parts.operations if each.name not in PHASES]
 
 
 def _append(circuit: Circuit, operation: Any, place: Mapping[Any, int]) -> None:
     """Append one of PennyLane's elementary operators."""
     on = [place[wire] for wire in operation.wires]
-    angles = [
-        each.item() if isinstance(each, np.ndarray) and each.ndim == 0 else each for each in operation.data
-    ]
+    angles = [each.item() if getattr(each, "ndim", 1) == 0 else each for each in operation.data]
     if any(isinstance(each, np.ndarray) for each in angles):
-        raise CircuitError(
-            f"{operation.name} has an array as its angle: give it one number, such as inputs[..., 0]"
-        )
+        raise CircuitError("an array is its angle: give it one number, such as inputs[..., 0]")
     if operation.name == "ControlledPhaseShift":
         circuit.append("U3", on[1], 0.0, *angles, 0.0, control=on[0])
-    elif operation.name in _FIXED:
-        gate, constants = _FIXED[operation.name]
-        circuit.append(gate, on, *constants)
+    elif operation.name.startswith("Adjoint"):
+        circuit.append("RZ", on, -np.pi / (2 if "S" in operation.name else 4))
     else:
         gate, controlled = GATES[operation.name]
-        circuit.append(gate.strip("()"), on[controlled:], *angles, control=on[0] if controlled else None)
+        circuit.append(gate, on[controlled:], *angles, control=on[0] if controlled else None)
 
 
 def _word(measurement: Any, name: str) -> dict[Any, str]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from qrlsuite import registry, specs
-from qrlsuite.circuit import Circuit, create_backend
+from qrlsuite.circuit import Circuit, create_backend, lightcone
 from qrlsuite.errors import CircuitError, OptionError
 from qrlsuite.testing import effects
 from qrlsuite.testing.common import Subject
@@ -40,7 +40,7 @@ def check(subject: Subject) -> list[Finding]:
     with one_thread():
         message = "every input and every parameter changes an expectation value"
         if rules.run("effects", message, lambda: _effects(circuits, grows)):
-            rules.findings[-1] = Finding("effects", True, message + _idle(circuits))
+            rules.findings[-1] = Finding("effects", True, f"{message}; {_light_cone(circuits)}")
         same = "every installed backend gives the values of dense matrices"
         if rules.run("backends", same, lambda: _backends(circuits)):
             rules.run(
@@ -123,7 +123,7 @@ def _parameters(circuits: Circuits) -> None:
             unused = [i for i in range(parameter.size) if (name, i) not in used]
             require(
                 not unused,
-                f"{size}: {effects.written(parameter, unused[0] if unused else 0)} of shape {parameter.shape} sets "
+                f"{size}: {parameter.written(unused[0] if unused else 0)} of shape {parameter.shape} sets "
                 f"no angle ({len(unused)} of {parameter.size} do not); declare a smaller parameter or use all of it",
             )
 
@@ -146,10 +146,16 @@ def _effects(circuits: Circuits, grows: bool) -> None:
             effects.require_middle(circuit, size)
 
 
-def _idle(circuits: Circuits) -> str:
-    """Name the parameters and gates without effect in the largest circuit of up to three layers."""
+def _light_cone(circuits: Circuits) -> str:
+    """Say what the structure of the largest circuit of up to three layers leaves without effect."""
     largest = max(size for size in circuits if size[1] in LAYERS)
-    return effects.idle_at_the_ends(circuits[largest], effects.size(*largest))
+    deeper = sorted((layers, each) for (qubits, layers), each in circuits.items() if qubits == largest[0])
+    cone = lightcone.described(circuits[largest], deeper)
+    sees = "layers_until_every_output_sees_every_input"
+    return (
+        f"dead parameters ({effects.size(*largest)}): {cone['dead_parameters']}; "
+        f"{sees.replace('_', ' ')}: {cone[sees]}"
+    )
 
 
 def _smallest(circuits: Circuits) -> Circuit:

@@ -10,8 +10,7 @@ value. In the first and last layers of a circuit that repeats one pattern this i
   as there are qubits lie on either side of that third: enough for a chain of gates between neighbors to carry an
   effect from any qubit to any other.
 
-Effects are found by gradients at random points, and their likely cause by gradients of the same circuit begun in a
-random entangled state, or measured in a random basis.
+Effects are found by gradients at random points, and their likely cause by the circuit's light cone.
 """
 
 from __future__ import annotations
@@ -19,10 +18,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from qrlsuite import registry, specs
-from qrlsuite.circuit import Circuit, Parameter, create_backend
+from qrlsuite.circuit import Circuit, create_backend, lightcone
 from qrlsuite.testing.findings import BrokenRuleError, require
 
 POINTS = 4
@@ -84,11 +81,6 @@ def uses(circuit: Circuit) -> dict[Scalar, list[int]]:
     return places
 
 
-def written(parameter: Parameter, index: int) -> str:
-    """Return a scalar as an author writes it: `weights[1, 2]`."""
-    return f"{parameter.name}{[int(i) for i in np.unravel_index(index, parameter.shape)]}"
-
-
 def effective(circuit: Circuit) -> tuple[set[int], set[Scalar]]:
     """Return the input features, and the trainable scalars, that change an expectation value."""
     names = registry.load().names(specs.CircuitBackendSpec)
@@ -140,53 +132,21 @@ def require_middle(circuit: Circuit, size: str) -> None:
         parameter = circuit.parameters[name]
         others = f", nor on {len(idle) - 1} more there" if len(idle) > 1 else ""
         raise BrokenRuleError(
-            f"{size}: no expectation value depends on {written(parameter, index)} of shape {parameter.shape}, which "
+            f"{size}: no expectation value depends on {parameter.written(index)} of shape {parameter.shape}, which "
             f"is used in the middle of the circuit{others}; it is trained for nothing: {cause(circuit, (name, index))}"
         )
 
 
 def cause(circuit: Circuit, source: int | Scalar) -> str:
     """Say why an input feature or a trainable scalar has no effect."""
-    for before, after, why in ((True, False, _START), (False, True, _END), (True, True, _BOTH)):
-        inputs, scalars = effective(_between(circuit, before, after))
-        if source in inputs or source in scalars:
-            return why
-    return _CANCELS
-
-
-def _between(circuit: Circuit, before: bool, after: bool) -> Circuit:
-    """Return the circuit begun in a random entangled state, or measured in a random basis, or both."""
-    part = Circuit(circuit.qubits, circuit.inputs, circuit.mean_field)
-    for p in circuit.parameters.values():
-        part.parameter(p.name, p.shape, p.low, p.high)
-    draw = np.random.default_rng(0)
-
-    def scramble() -> None:
-        for _ in range(2):
-            for q in range(circuit.qubits):
-                part.append("U3", q, *draw.uniform(0.5, 2.5, 3))
-            for q in range(circuit.qubits - 1):
-                part.append("CNOT", (q, q + 1))
-
-    if before:
-        scramble()
-    for op in circuit.operations:
-        part.append(op.gate, op.wires, *op.angles, control=op.control)
-    if after:
-        scramble()
-    else:
-        part.measure(circuit.observables)
-    return part
-
-
-def idle_at_the_ends(circuit: Circuit, size: str) -> str:
-    """Name the trainable scalars without effect; `""` where there are none."""
-    _, scalars = effective(circuit)
-    idle = [scalar for scalar in uses(circuit) if scalar not in scalars]
-    if not idle:
-        return ""
-    named = ", ".join(written(circuit.parameters[name], index) for name, index in idle[:3])
-    return (
-        f"; at the ends of the circuit {len(idle)} of {circuit.parameter_count} scalars do not ({size}: {named}"
-        f"{', ...' * (len(idle) > 3)})"
-    )
+    mine = [
+        use
+        for use in lightcone.uses(circuit)
+        if source in use.angle.inputs
+        or source in {(each.parameter, each.index) for each in use.angle.elements}
+    ]
+    if any(use.alive for use in mine):
+        return _CANCELS
+    if any(any(use.observables) for use in mine):
+        return _START
+    return _END if any(use.state for use in mine) else _BOTH

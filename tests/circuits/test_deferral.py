@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pennylane as qml
 import pytest
@@ -9,8 +11,8 @@ import torch
 from qiskit import ClassicalRegister, QuantumCircuit, QuantumRegister
 from qiskit_aer.primitives import SamplerV2 as AerSampler
 
-from qrlsuite.circuit import Circuit, expectations
-from qrlsuite.errors import CircuitError
+from qrlsuite.circuit import expectations
+from qrlsuite.circuit.tracing import trace
 from qrlsuite.plugins.circuits.native.qiskit_primitives import EstimatorV2, SamplerV2
 from qrlsuite.testing.dense import expectation_values
 
@@ -35,41 +37,30 @@ def program(seed: int) -> list[Step]:
     return steps
 
 
-def ours(steps: list[Step]) -> tuple[Circuit, list]:
-    circuit, outcomes = Circuit(WIRES), []
-    angle = circuit.input(0)
-    for kind, q, number in steps:
-        if kind == "measure":
-            outcomes.append(circuit.measure_mid(q))
-        elif kind == "reset":
-            circuit.reset(q)
-        elif kind.startswith("if"):
-            gate = kind.split()[1]
-            angles = [number * angle] if gate in ("RX", "RY") else []
-            circuit.append(gate, q, *angles, control=outcomes[-1])
-        elif kind == "CNOT":
-            circuit.append(kind, (q, (q + 1) % WIRES))
-        else:
-            circuit.append(kind, q, number * angle)
-    return circuit, outcomes
+weight_shapes: dict[str, Any] = {}
+ENDS = [qml.Z(0), qml.X(1), qml.Z(0) @ qml.Y(2)]
 
 
-@qml.qnode(qml.device("default.qubit"))
-def pennylanes(steps: list[Step]) -> list:
-    outcomes: list = []
-    for kind, q, number in steps:
-        if kind in ("measure", "reset"):
-            outcome = qml.measure(q, reset=kind == "reset")
-            outcomes += [outcome] if kind == "measure" else []
-        elif kind.startswith("if"):
-            gate = kind.split()[1]
-            qml.cond(outcomes[-1], getattr(qml, gate))(*([number] if gate in ("RX", "RY") else []), wires=q)
-        elif kind == "CNOT":
-            qml.CNOT([q, (q + 1) % WIRES])
-        else:
-            getattr(qml, kind)(number, wires=q)
-    ends = [qml.Z(0), qml.X(1), qml.Z(0) @ qml.Y(2)]
-    return [*map(qml.expval, ends), *(qml.expval(outcome) for outcome in outcomes)]
+def of(steps: list[Step]) -> Any:
+    """Return PennyLane's quantum function of a program."""
+
+    def function(inputs: Any) -> list[Any]:
+        outcomes: list[Any] = []
+        for kind, q, number in steps:
+            if kind in ("measure", "reset"):
+                outcome = qml.measure(q, reset=kind == "reset")
+                outcomes += [outcome] if kind == "measure" else []
+            elif kind.startswith("if"):
+                gate = kind.split()[1]
+                angles = [number * inputs[0]] if gate in ("RX", "RY") else []
+                qml.cond(outcomes[-1], getattr(qml, gate))(*angles, wires=q)
+            elif kind == "CNOT":
+                qml.CNOT([q, (q + 1) % WIRES])
+            else:
+                getattr(qml, kind)(number * inputs[0], wires=q)
+        return [qml.expval(end) for end in ENDS]
+
+    return function
 
 
 def qiskits(steps: list[Step]) -> QuantumCircuit:
@@ -97,19 +88,18 @@ def qiskits(steps: list[Step]) -> QuantumCircuit:
 @pytest.mark.parametrize("seed", range(8))
 def test_values_are_those_of_pennylane_and_aer(seed: int) -> None:
     steps = program(seed)
-    circuit, outcomes = ours(steps)
-    different = list(dict.fromkeys(outcomes))  # a qubit that is measured twice is found the same
-    circuit.measure([0, "X1", "Z0 Y2", *different])
-    found = expectations(circuit, torch.ones(1, WIRES, dtype=torch.float64), {})[0].numpy()
-    expected = np.array(pennylanes(steps))[[0, 1, 2, *(3 + outcomes.index(each) for each in different)]]
-    expected[3:] = 1 - 2 * expected[3:]
+    circuit = trace(of(steps), WIRES)
+    assert circuit.qubits - circuit.deferred == WIRES
+    assert circuit.observables == (0, "X1", "Z0 Y2")
+    expected = qml.QNode(of(steps), qml.device("default.qubit"))([1.0])
+    found = expectations(circuit, torch.ones(1, 1, dtype=torch.float64), {})[0].numpy()
     np.testing.assert_allclose(found, expected, atol=1e-12)
-    np.testing.assert_allclose(expectation_values(circuit, np.ones(WIRES), {}), expected, atol=1e-12)
+    np.testing.assert_allclose(expectation_values(circuit, np.ones(1), {}), expected, atol=1e-12)
 
     made = qiskits(steps)
     observables = ["IIZ", "IXI", "YIZ"]
     means = EstimatorV2().run([(made, [[each] for each in observables])]).result()[0].data.evs[:, 0]
-    np.testing.assert_allclose(means, expected[:3], atol=1e-12)
+    np.testing.assert_allclose(means, expected, atol=1e-12)
     made.measure(range(WIRES), made.cregs[1])
     samplers = SamplerV2(seed=1), AerSampler(seed=1)
     joint = []
@@ -131,54 +121,16 @@ def test_values_are_those_of_pennylane_and_aer(seed: int) -> None:
     ],
 )
 def test_every_backend_runs_them_with_gradients(backend: str, options: dict) -> None:
-    steps = program(3)
-    circuit, outcomes = ours(steps)
-    circuit.measure([0, 1, (0, 2), *dict.fromkeys(outcomes)])
+    circuit = trace(of(program(3)), WIRES)
+    circuit.measure([0, 1, (0, 2)])
     values, gradients = [], []
     for name, chosen in (("native", {}), (backend, options)):
-        x = torch.full((1, WIRES), 0.7, dtype=torch.float64, requires_grad=True)
+        x = torch.full((1, 1), 0.7, dtype=torch.float64, requires_grad=True)
         values.append(expectations(circuit, x, {}, name, seed=2, **chosen))
         gradients.append(torch.autograd.grad(values[-1].sum(), x)[0])
     exact = "shots" not in options
     torch.testing.assert_close(*values, rtol=0, atol=1e-9 if exact else 5 / SHOTS**0.5)
     torch.testing.assert_close(*gradients, rtol=0, atol=1e-9 if exact else 0.5)
-
-
-def test_a_qubit_more_for_each_reset_and_each_measured_qubit_that_is_used_again() -> None:
-    circuit = Circuit(2)
-    circuit.reset(0)  # nothing has acted on it
-    circuit.append("H", 0)
-    outcome = circuit.measure_mid(0)
-    assert circuit.measure_mid(0) == outcome
-    circuit.append("X", 1, control=outcome)
-    assert (circuit.qubits, circuit.deferred) == (2, 0)
-    circuit.append("H", 0)
-    circuit.append("RY", 0, 0.3, control=outcome)
-    assert (circuit.qubits, circuit.deferred) == (3, 1)
-    circuit.measure_mid(1)
-    circuit.reset(1)
-    assert (circuit.qubits, circuit.inputs, circuit.observables) == (4, 2, (0, 3))
-    circuit.measure(["X0"])
-    circuit.measure_mid(0)  # what is measured has no X any more
-    assert circuit.qubits == 5
-    assert expectations(circuit, [[0.0, 0.0]], {})[0, 0].abs() < 1e-12
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        (lambda c, o: c.measure_mid(0, postselect=1), "postselect = 1: no run may be thrown away"),
-        (lambda c, o: c.measure_mid(2), r"measure_mid\(2\): this circuit has qubits 0..1"),
-        (lambda c, o: c.reset(o), r"reset\(.*\): this circuit has qubits 0..1"),
-        (lambda c, o: c.append("CNOT", (0, 1), control=o), "CNOT takes no extra control"),
-        (lambda c, o: c.append("X", o), "this circuit has qubits 0..1"),
-        (lambda c, o: c.measure([o, o]), "distinct"),
-    ],
-)
-def test_what_cannot_be_deferred_is_refused(wrong, sentence: str) -> None:
-    circuit = Circuit(2)
-    with pytest.raises(CircuitError, match=sentence):
-        wrong(circuit, circuit.measure_mid(0))
 
 
 def test_a_register_is_compared_with_a_number() -> None:

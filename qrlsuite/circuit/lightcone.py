@@ -1,0 +1,163 @@
+"""What the outputs of a circuit can depend on, by its structure: no circuit is run.
+
+Observables go back through the gates, and the initial state goes forward, as the Paulis that either may hold on each
+qubit. A gate that commutes with all of them changes nothing, whatever the parameters: RZ right before Z is measured,
+say, or any gate outside of the light cone of an observable. A parameter that is said to be dead is dead. The converse
+may fail: Paulis are kept qubit by qubit, without their correlations.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
+from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
+
+PAULIS: dict[str, Matrix] = {"I": np.eye(2, dtype=np.complex128), "X": X, "Y": Y, "Z": Z}
+ROTATIONS = {"RX": "X", "RY": "Y", "RZ": "Z"}
+ANY = 0.7345
+"""An angle that stands for any: no rotation by it maps a Pauli to another one."""
+
+Letters = frozenset[str]
+Step = tuple[str, float, bool, tuple[int, ...], Angle | None]
+"""A gate's name, angle (`ANY` for one that varies), whether its first qubit controls it, its qubits, and the angle."""
+
+
+class Use(NamedTuple):
+    """A gate's angle that varies: whether the gate changes the state, and each observable, that reaches it."""
+
+    angle: Angle
+    state: bool
+    observables: tuple[bool, ...]
+
+    @property
+    def alive(self) -> bool:
+        """Whether an output may depend on the angle."""
+        return self.state and any(self.observables)
+
+
+def uses(circuit: Circuit) -> list[Use]:
+    """Return the angles of a circuit that vary, in order of application; of a `Rot` each of the three."""
+    steps = list(_steps(circuit))
+    state = _changed(steps, [frozenset("Z")] * circuit.qubits, heisenberg=False)
+    backward = []
+    for qubits, axes in zip(circuit.measured, circuit.axes):
+        word = dict(zip(qubits, axes))
+        measured = [frozenset(word.get(q, "")) for q in range(circuit.qubits)]
+        backward.append(_changed(steps[::-1], measured, heisenberg=True)[::-1])
+    each = zip(steps, state, zip(*backward))
+    return [Use(angle, before, after) for (*_, angle), before, after in each if angle is not None]
+
+
+def _seen(circuit: Circuit) -> list[set[int]]:
+    """Return of each observable the inputs on which it may depend."""
+    found: list[set[int]] = [set() for _ in circuit.observables]
+    for use in uses(circuit):
+        for inputs, reached in zip(found, use.observables):
+            inputs |= use.angle.inputs if use.state and reached else set()
+    return found
+
+
+def described(circuit: Circuit, sizes: Iterable[tuple[int, Circuit]]) -> dict[str, str]:
+    """Describe what reaches the outputs of a circuit, in words.
+
+    Parameters
+    ----------
+    sizes:
+        The same ansatz by numbers of layers, in their order: they are read until every output sees every input.
+    """
+    layers, least = 0, ""
+    for layers, each in sizes:
+        if all(len(inputs) == each.inputs for inputs in _seen(each)):
+            least = str(layers)
+            break
+    alive = {element for use in uses(circuit) if use.alive for element in use.angle.elements}
+    names = [
+        parameter.written(k)
+        for name, parameter in circuit.parameters.items()
+        for k in range(parameter.size)
+        if Element(name, k) not in alive
+    ]
+    some = ", ".join([*names[:3], *["..."] * (len(names) > 3)])
+    seen = _seen(circuit)
+    unseen = sorted(set(range(circuit.inputs)).difference(*seen))
+    counts = sorted(set(map(len, seen)))
+    return {
+        "dead_parameters": f"{len(names)} of {circuit.parameter_count}: {some}" if names else "none",
+        "inputs_that_no_output_sees": ", ".join(map(str, unseen)) or "none",
+        "inputs_that_an_output_sees": f"{' or '.join(map(str, counts))} of {circuit.inputs}",
+        "layers_until_every_output_sees_every_input": least or f"more than {layers}",
+    }
+
+
+def _steps(circuit: Circuit) -> Iterator[Step]:
+    """Yield the gates as fixed gates and rotations about one axis, in order."""
+    for operation in circuit:
+        controlled = operation.control is not None
+        if not operation.angles:
+            yield operation.gate, ANY, controlled, operation.qubits, None
+        for name, angle, qubits in _rotations(operation):
+            value = ANY if angle.varies else angle.constant
+            yield name, value, len(qubits) > 1, qubits, angle if angle.varies else None
+
+
+def _rotations(operation: Operation) -> Iterator[tuple[str, Angle, tuple[int, ...]]]:
+    gate, qubits, angles = operation.gate, operation.qubits, operation.angles
+    if gate in ROTATIONS:
+        yield gate, angles[0], qubits
+    elif angles:
+        order = (0, 1, 2) if gate == "Rot" else (2, 0, 1)  # U3 is a phase times Rot(delta, theta, phi)
+        for name, place in zip(("RZ", "RY", "RZ"), order):
+            yield name, angles[place], qubits
+        for place in (1, 2) if gate == "U3" and operation.control is not None else ():
+            yield "RZ", angles[place], qubits[:1]
+
+
+def _changed(steps: list[Step], letters: list[Letters], heisenberg: bool) -> list[bool]:
+    """Return which steps change an operator with these Paulis on the qubits, moved through them."""
+    letters, changes = list(letters), []
+    for name, angle, controlled, qubits, _ in steps:
+        after, changed = _image(name, angle, controlled, tuple(letters[q] for q in qubits), heisenberg)
+        for qubit, own in zip(qubits, after):
+            letters[qubit] = own
+        changes.append(changed)
+    return changes
+
+
+@cache
+def _image(
+    name: str, angle: float, controlled: bool, letters: tuple[Letters, ...], heisenberg: bool
+) -> tuple[tuple[Letters, ...], bool]:
+    """Return the Paulis on a gate's qubits behind it, and whether it changes any product of them."""
+    if name in FIXED:
+        matrix = FIXED[name]
+    else:
+        turn = -1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
+        matrix = (np.cos(angle / 2) * PAULIS["I"] + turn).astype(np.complex128)
+    if controlled:
+        matrix = np.block([[PAULIS["I"], np.zeros((2, 2))], [np.zeros((2, 2)), matrix]]).astype(np.complex128)
+    if heisenberg:
+        matrix = np.conj(matrix.T)
+    after: list[set[str]] = [set() for _ in letters]
+    changed = False
+    for given in itertools.product(*({"I", *own} for own in letters)):
+        before = _product(given)
+        moved = matrix @ before @ matrix.conj().T
+        changed |= not np.allclose(moved, before, atol=1e-12)
+        for word in itertools.product(PAULIS, repeat=len(letters)):
+            if abs(np.trace(_product(word) @ moved)) > 1e-9:
+                for own, letter in zip(after, word):
+                    own.update({letter} - {"I"})
+    return tuple(map(frozenset, after)), changed
+
+
+def _product(word: Sequence[str]) -> Matrix:
+    matrix = PAULIS[word[0]]
+    for letter in word[1:]:
+        matrix = np.kron(matrix, PAULIS[letter])
+    return matrix
