@@ -11,9 +11,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
 from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
@@ -134,15 +135,15 @@ def _image(
     name: str, angle: float, controlled: bool, letters: tuple[Letters, ...], heisenberg: bool
 ) -> tuple[tuple[Letters, ...], bool]:
     """Return the Paulis on a gate's qubits behind it, and whether it changes any product of them."""
+    matrix: NDArray[Any]
     if name in FIXED:
         matrix = FIXED[name]
     else:
-        turn = -1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
-        matrix = (np.cos(angle / 2) * PAULIS["I"] + turn).astype(np.complex128)
+        matrix = np.cos(angle / 2) * PAULIS["I"] - 1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
     if controlled:
-        matrix = np.block([[PAULIS["I"], np.zeros((2, 2))], [np.zeros((2, 2)), matrix]]).astype(np.complex128)
+        matrix = np.kron(np.diag([1, 0]), PAULIS["I"]) + np.kron(np.diag([0, 1]), matrix)
     if heisenberg:
-        matrix = np.conj(matrix.T)
+        matrix = matrix.conj().T
     after: list[set[str]] = [set() for _ in letters]
     changed = False
     for given in itertools.product(*({"I", *own} for own in letters)):
