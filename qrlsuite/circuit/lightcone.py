@@ -14,7 +14,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
 from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
@@ -135,20 +134,18 @@ def _image(
     name: str, angle: float, controlled: bool, letters: tuple[Letters, ...], heisenberg: bool
 ) -> tuple[tuple[Letters, ...], bool]:
     """Return the Paulis on a gate's qubits behind it, and whether it changes any product of them."""
-    matrix: NDArray[Any]
-    if name in FIXED:
-        matrix = FIXED[name]
-    else:
-        matrix = np.cos(angle / 2) * PAULIS["I"] - 1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
+    gate: Any = FIXED.get(name)
+    if gate is None:
+        gate = np.cos(angle / 2) * PAULIS["I"] - 1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
     if controlled:
-        matrix = np.kron(np.diag([1, 0]), PAULIS["I"]) + np.kron(np.diag([0, 1]), matrix)
+        gate = np.kron(np.diag([1, 0]), PAULIS["I"]) + np.kron(np.diag([0, 1]), gate)
     if heisenberg:
-        matrix = matrix.conj().T
+        gate = gate.conj().T
     after: list[set[str]] = [set() for _ in letters]
     changed = False
     for given in itertools.product(*({"I", *own} for own in letters)):
         before = _product(given)
-        moved = matrix @ before @ matrix.conj().T
+        moved = gate @ before @ gate.conj().T
         changed |= not np.allclose(moved, before, atol=1e-12)
         for word in itertools.product(PAULIS, repeat=len(letters)):
             if abs(np.trace(_product(word) @ moved)) > 1e-9:
@@ -160,5 +157,5 @@ def _image(
 def _product(word: Sequence[str]) -> Matrix:
     matrix = PAULIS[word[0]]
     for letter in word[1:]:
-        matrix = np.kron(matrix, PAULIS[letter])
+        matrix = np.asarray(np.kron(matrix, PAULIS[letter]), dtype=np.complex128)
     return matrix
