@@ -192,7 +192,8 @@ def _first_is_default(known: notation.Written) -> bool:
     models, first = registry.load().of(specs.ModelSpec), known.settings[0]
     if known.model not in models:
         return True
-    return options.plain(specs.resolve(models[known.model].spec.options)()).get(first.name) == first.value
+    usual = options.plain(specs.resolve(models[known.model].spec.options)())
+    return bool(usual.get(first.name) == first.value)
 
 
 def mentions(entry: Named, word: str) -> bool:

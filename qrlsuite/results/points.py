@@ -158,42 +158,58 @@ def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Po
     """
     rows, of_runs = _Rows(), list[Path]()
     for path in dict.fromkeys(paths):
-        if run_files.holds_one_run(path):
+        if run_files.holds_one_run(path) or _names_no_run(path):
             of_runs.append(path)
         else:
             _read_csv(path, rows, metric)
     for (entry, seed), files in _named(_by_words(of_runs)).items():
-        name, curve = run_files.read(files, metric)
+        name, curve = _curve_of(files, metric)
         for step, score in curve:
             rows.add(entry, seed, step, score, str(files[0]), name)
     return rows.points()
 
 
 def read_run(paths: Sequence[Path], metric: str | None = None) -> Points:
-    """Read the files of one run, whose entry and seed are known: a csv file needs the columns of step and score alone.
+    """Read the files of one run, whose entry and seed are known."""
+    rows = _Rows()
+    name, curve = _curve_of(paths, metric)
+    for step, score in curve:
+        rows.add("run", 0, step, score, str(paths[0]), name)
+    return next(iter(rows.points().values()))
 
-    Of several scores at one step, as lanes write them whose episodes end at once, the last counts.
+
+def _curve_of(paths: Sequence[Path], metric: str | None) -> tuple[str, run_files.Curve]:
+    """Return the score's name and the curve of the files of one run; of a csv file, the columns of step and score.
+
+    Of several scores at one step, as lanes write them whose episodes end at once, the last counts. Rows of other
+    metrics lack the score.
     """
-    rows, at, source = _Rows(), dict[int, float](), str(paths[0])
     if run_files.holds_one_run(paths[0]):
         name, curve = run_files.read(paths, metric)
-        at.update(curve)
-    else:
-        content = cells_of(paths[0], lines_of(paths[0]))
-        _, head = next(content, (0, list[str]()))
-        names = [each.strip() for each in head]
-        columns = _columns(names, metric, source, COLUMNS[2:])
-        (time, value), name = map(names.index, columns), _measure(columns)
-        for line, cells in content:
-            try:
+        return name, dict(curve).items()
+    if len(paths) > 1:
+        raise FileError(f"{paths[0]} and {paths[1]} are of one run by their paths: name one of them")
+    content = cells_of(paths[0], lines_of(paths[0]))
+    _, head = next(content, (0, list[str]()))
+    names = [each.strip() for each in head]
+    columns = _columns(names, metric, str(paths[0]), COLUMNS[2:])
+    (time, value), at = map(names.index, columns), dict[int, float]()
+    for line, cells in content:
+        try:
+            if cells[value].strip() or columns[1] == "score":
                 at[whole(cells[time])] = float(cells[value])
-            except (ValueError, IndexError, OverflowError):
-                raise FileError(
-                    f"{source}, line {line}: no step and score: {','.join(cells)[:80]!a}"
-                ) from None
-    for step, score in at.items():
-        rows.add("run", 0, step, score, source, name)
-    return next(iter(rows.points().values()))
+        except (ValueError, IndexError, OverflowError):
+            row = ",".join(cells)[:80]
+            raise FileError(f"{paths[0]}, line {line}: no step and score: {row!a}") from None
+    return _measure(columns), at.items()
+
+
+def _names_no_run(path: Path) -> bool:
+    """Return whether a csv file has steps, and no column of entries or seeds: its path names its run."""
+    _, head = next(cells_of(path, lines_of(path)), (0, list[str]()))
+    names = [name.strip() for name in head]
+    named = _column("entry", names) or _column("seed", names) or _charts(names, None)
+    return bool(_column("step", names)) and not named
 
 
 def _read_csv(path: Path, rows: _Rows, metric: str | None) -> None:

@@ -95,10 +95,12 @@ def holds_one_run(path: Path) -> bool:
 def words(path: Path) -> tuple[str, ...]:
     """Return the words that name the run of a file: words that may name its entry, and last the run's own name.
 
-    The words are the folders of the path. The last folder names the run, unless the file itself does.
+    The words are the folders of the path. The last folder names the run, unless the file itself does: an npz file with
+    a name of its own, or a csv file whose columns no program fixes.
     """
     place = path.absolute()
-    named_by_itself = _kind(path) is _evaluations and path.name != "evaluations.npz"
+    kind = _kind(path)
+    named_by_itself = kind is None or (kind is _evaluations and path.name != "evaluations.npz")
     run = place.with_suffix("") if named_by_itself else place.parent
     return (*run.parent.parts[1:], run.name)
 

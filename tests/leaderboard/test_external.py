@@ -296,6 +296,28 @@ def test_columns_may_have_their_usual_other_names(columns: str, tmp_path: Path) 
     assert own.metric.partition(" by ")[0] in columns
 
 
+def test_files_of_one_run_are_named_by_their_paths(tmp_path: Path) -> None:
+    """As two programs leave them: entries and seeds stand in no column, other metrics in rows of their own."""
+    for name, head, row in (
+        (
+            "cleanrl/CartPole-v1__ppo__1__1700000000.csv",
+            "global_step,loss,charts/episodic_return",
+            "10,,3\n10,,4\n11,1,",
+        ),
+        ("mine/seed_1.csv", "step,charts/episodic_return", "10,5"),
+    ):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(f"{head}\n{row}\n")
+    found = points.read_files(sorted(tmp_path.glob("*/*.csv")))
+    assert {run: own.scores.tolist() for run, own in found.items()} == {
+        ("cleanrl CartPole-v1__ppo", 1): [4],
+        ("mine", 1): [5],
+    }
+    (tmp_path / "mine" / "seed_1.csv").write_text("step,score\n10,\n")
+    with pytest.raises(QrlSuiteError, match="line 2: no step and score: '10,'"):
+        points.read_files([tmp_path / "mine" / "seed_1.csv"])
+
+
 def test_curves_of_racetraq_as_they_are_published(qrlsuite: Callable[..., Any]) -> None:
     """Eight real runs each, as their author wrote them; some evaluations are one or two episodes late.
 

@@ -13,6 +13,7 @@ from qrlsuite import api
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import EXTERNAL
 from qrlsuite.leaderboard.shelf import import_curves, import_seeds, published_studies
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.results import run_files
@@ -84,7 +85,9 @@ def import_entries(
     elif files:
         for line in import_curves.told(done):
             typer.echo(line)
-        typer.echo(f"next: {command('leaderboard', '--task', done[0].task, runs=runs)}")
+        names = [each.label.removeprefix(f"{EXTERNAL} ") for each in done]
+        words = ["compare", *names] if len(names) == 2 else ["leaderboard"]
+        typer.echo(f"next: {command(*words, '--task', done[0].task, runs=runs)}")
     else:
         typer.echo(f"next: {command('runs', runs=runs)}")
 
