@@ -242,6 +242,12 @@ class ModelSpec(NumericSpec):
         )
 
 
+def most_steps(environment_options: Mapping[str, Any]) -> int | None:
+    """Return the most steps of an episode, where an option of the environment says it."""
+    found: int | None = environment_options.get("max_episode_steps") or environment_options.get("steps")
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class AlgorithmSpec(NumericSpec):
     """A learning algorithm: one file with an options dataclass and a class (see `qrlsuite.algorithm`).
@@ -258,7 +264,8 @@ class AlgorithmSpec(NumericSpec):
         Values of options that a task's preset leaves out, and those of the quick look `--task gym:ID`.
     unusable:
         Reference to `unusable(options, epochs, rounds, environments) -> list[str]`: sentences on options (values by
-        name) that are of no use in a run of so many epochs, each of so many rounds, steps of every one of a seed's
+        name, and the most steps of an `episode`, None where unknown) that are of no use in a run of so many epochs,
+        each of so many rounds, steps of every one of a seed's
         environments. Boards call it, so its module imports no torch. None says nothing.
     """
 

@@ -408,19 +408,13 @@ def read_entry(store: EntryStore) -> EntryResults | None:
                 f"{store.path}: not ranked, for its seeds are not independent: trained again, seed {probe.seed} "
                 f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
             )
-    asked = requests.read(store)
-    facts = {
-        "mark": store.mark,
-        "refused": tuple(refused),
-        "asked": asked.asked,
-        "withdrawn": asked.withdrawn,
-    }
+    asked, withdrawn = requests.read(store)
+    facts = {"mark": store.mark, "refused": tuple(refused), "asked": asked, "withdrawn": withdrawn}
     found = EntryResults.of(record, store.path, {run.seed: run for run in runs}, **facts)
-    for other in store.path.parent.glob(f"{store.name}*") if found.missing else ():
-        there = EntryStore(other).finished(found.asked, found.epochs)
-        if other != store.path and len(there) == len(found.asked):
+    for other in {*store.path.parent.glob(f"{store.name}*")} - {store.path} if found.missing else ():
+        if EntryStore(other).finished(asked, found.epochs) == asked.keys():
             moved = dict.fromkeys(found.missing, f"trained anew, by another code ({other.name})")
-            return replace(found, asked={}, withdrawn={**found.withdrawn, **moved})
+            return replace(found, asked={}, withdrawn={**withdrawn, **moved})
     return found
 
 

@@ -19,7 +19,7 @@ from qrlsuite.files import read_bytes
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint, unknown
-from qrlsuite.results import codes, probes, requests
+from qrlsuite.results import codes, probes
 from qrlsuite.results.records import Provenance
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import Arrays, EntryStore, SeedRun, parameters_of
@@ -74,7 +74,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
             f"'{entry.label}' is not complete: {len(unfinished)} of {len(runs)} seeds are still training; "
             "repeat the `qrlsuite run` that made it"
         )
-    withdrawn = [line.content for line in requests.lines(store) if line.withdrawn and entry.withdrawn]
+    withdrawn = {str(seed): reason for seed, reason in entry.withdrawn.items()}
     records = [run.record for run in runs if run.record is not None]
     code = records[0].code
     content = published.files(

@@ -148,9 +148,7 @@ def import_seeds(source: EntryStore, runs: Path, study: str | None = None) -> Im
                 notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
             if without := sorted(set(new) - set(agents)):
                 notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
-        requests.take_over(
-            store, requests.lines(source) if exported is None else exported.published.withdrawn
-        )
+        requests.take_over(store, *(requests.read(source) if exported is None else ({}, exported.withdrawn)))
         now, kept = identity.of(entry), codes.of(store)
         if (plugins := identity.plugins(entry)) and (kept is None or now in kept):
             codes.prepare(store, now, plugins)

@@ -43,7 +43,6 @@ from qrlsuite.results.records import (
     PublishedRecord,
     RunRecord,
 )
-from qrlsuite.results.requests import Requests
 from qrlsuite.results.store import (
     Arrays,
     EntryStore,
@@ -150,13 +149,16 @@ class PublishedEntry:
         missing = next(seed for seed, held in enumerate(self.seeds) if seed != held)
         return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
 
+    @property
+    def withdrawn(self) -> dict[int, str]:
+        """Why seeds that were asked for no longer are, by seed."""
+        return {int(seed): reason for seed, reason in self.published.withdrawn.items()}
+
     def entry_results(self) -> EntryResults:
         """Return the entry as a leaderboard ranks it."""
         runs = {seed: self.run(row) for row, seed in enumerate(self.seeds)}
-        withdrawn = Requests.of(self.published.withdrawn).withdrawn
-        return EntryResults.of(
-            self.record, self.folder, runs, chosen_seeds=self.chosen_seeds, withdrawn=withdrawn
-        )
+        facts = {"chosen_seeds": self.chosen_seeds, "withdrawn": self.withdrawn}
+        return EntryResults.of(self.record, self.folder, runs, **facts)
 
     def run(self, row: int) -> SeedRun:
         """Return one seed in the form of a results folder; its `scores` are the means."""

@@ -50,6 +50,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="REINFORCE, the vanilla policy gradient, with or without a baseline",
             options="qrlsuite.plugins.algorithms.reinforce:REINFORCEOptions",
             factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
+            unusable="qrlsuite.plugins.algorithms:unusable_reinforce",
         )
     )
     register(
@@ -118,6 +119,16 @@ def unusable_ppo(own: Mapping[str, Any], epochs: int, rounds: int, environments:
         *_beyond("batch", own["batch"], samples, "samples of an epoch"),
         *_stops(own.get("decay_steps"), epochs * samples),
     ]
+
+
+def unusable_reinforce(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:
+    """Name episodes of which no update sees all steps: longer than an epoch with `memory`, or between two updates."""
+    updates, episode = own.get("epochs_per_update", 1), own["episode"]
+    option, most = f"memory={own['memory']}", own["memory"] + rounds
+    if updates > 1:
+        option, most = f"epochs_per_update={updates}", updates * rounds
+    enough = episode is None or episode <= most
+    return [] if enough else [f"{option} is too small for episodes of {episode} steps: an update sees {most}"]
 
 
 def unusable_warm_up(own: Mapping[str, Any], epochs: int, rounds: int, environments: int) -> list[str]:

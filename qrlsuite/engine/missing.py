@@ -127,7 +127,7 @@ def prepare(work: Missing) -> None:
     if work.groups:
         code = work.code or identity.of(work.entry)
         codes.prepare(work.store, code, identity.plugins(work.entry))
-        requests.ask(work.store, work.seeds, work.epochs, code.digest)
+        requests.add(work.store, work.seeds, work.epochs, code=code.digest)
 
 
 def _require_loadable(entry: Entry, store: EntryStore) -> None:

@@ -78,13 +78,11 @@ def choose(runs: Path, names: Sequence[str], task: str | None = None) -> list[En
     ]
 
 
-def delete_each(
-    runs: Path, chosen: Sequence[EntrySurvey], seeds: Sequence[int] = (), reason: str = ""
-) -> int:
-    """Delete entries with all their seeds, or some of them; returns the bytes that were freed."""
+def delete_each(runs: Path, chosen: Sequence[EntrySurvey]) -> int:
+    """Delete entries with all their seeds; returns the bytes that were freed."""
     queues, freed = Queues(), 0
     for entry in chosen:
         store = EntryStore(entry.folder)
         queued = queues.waiting(store) if entry.seeds.get("submitted") else None
-        freed += delete(runs, store, queued, seeds, reason)
+        freed += delete(runs, store, queued)
     return freed

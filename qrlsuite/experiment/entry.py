@@ -183,6 +183,7 @@ class Entry:
         if self.algorithm.unusable is None:
             return []
         own = options.plain(self.algorithm_options)
+        own["episode"] = specs.most_steps(options.plain(self.task.environment_options))
         judge = specs.resolve(self.algorithm.unusable)
         return list(judge(own, epochs, protocol.rounds, protocol.environments))
 

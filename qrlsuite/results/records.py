@@ -56,6 +56,7 @@ def _sorted_once(names: list[Any]) -> list[Any]:
 
 
 Line = Annotated[str, AfterValidator(_one_line)]
+Reason = Annotated[Line, Field(min_length=1, max_length=300)]
 Count = Annotated[int, Field(ge=0, lt=10**12)]
 Positive = Annotated[int, Field(ge=1, lt=10**9)]
 Name = Annotated[str, Field(pattern=specs.WHOLE_NAME)]
@@ -261,7 +262,7 @@ class RequestLine(Record):
     seeds: Annotated[list[Count], Field(min_length=1), AfterValidator(_sorted_once)]
     epochs: Count = 0
     code: str = ""
-    withdrawn: Annotated[Line, Field(min_length=1, max_length=300)] | None = None
+    withdrawn: Reason | None = None
     time: str = ""
 
 
@@ -281,7 +282,7 @@ class PublishedRecord(Record):
     """The facts of a published entry: numbers of `seeds` and `epochs`, `parameters` as `parameters_of` returns them.
 
     Each seed names one of the different provenances. `diverged` has by seed the first epoch after which its agent's
-    numbers were not finite. `measured` are metrics of the environment. `withdrawn` names seeds that were asked for.
+    numbers were not finite. `measured` are metrics of the environment. `withdrawn` says why seeds are not asked for.
     """
 
     seeds: Positive
@@ -294,7 +295,7 @@ class PublishedRecord(Record):
     probe: Annotated[ProbeRecord, AfterValidator(_independent)] | None = None
     agents: AgentsRecord | None = None
     measured: Annotated[list[Name], Field(max_length=100), AfterValidator(_sorted_once)] = []
-    withdrawn: list[RequestLine] = []
+    withdrawn: dict[Annotated[str, Field(pattern=r"^\d{1,12}$")], Reason] = {}
 
 
 PLUGINS = "plugins"

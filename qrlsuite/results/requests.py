@@ -1,4 +1,4 @@
-"""The seeds that were asked for: a line of `requests.jsonl` in the entry's folder, before they are trained.
+"""The seeds that were asked for: lines of `requests.jsonl` in the entry's folder, appended before they are trained.
 
 Verdicts name the seeds that were asked for and are not there. A request is withdrawn by a further line, with its
 reason. Results from before this record, published entries and curves of other programs have the seeds that they have.
@@ -7,9 +7,7 @@ reason. Results from before this record, published entries and curves of other p
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import genuine
@@ -22,37 +20,45 @@ from qrlsuite.results.text import counted
 FILE = "requests.jsonl"
 
 
-@dataclass(frozen=True)
-class Requests:
-    """The epochs to which seeds were asked for, and why requests were withdrawn, by seed."""
-
-    asked: dict[int, int]
-    withdrawn: dict[int, str]
-
-    @classmethod
-    def of(cls, lines: Iterable[RequestLine]) -> Requests:
-        """Return what lines come to: a later line about a seed counts more than an earlier one."""
-        found = cls({}, {})
-        for line in lines:
-            for seed in line.seeds:
-                if line.withdrawn is None:
-                    found.asked[seed] = max(found.asked.get(seed, 0), line.epochs)
-                    found.withdrawn.pop(seed, None)
-                else:
-                    found.asked.pop(seed, None)
-                    found.withdrawn[seed] = line.withdrawn
-        return found
+def read(store: EntryStore) -> tuple[dict[int, int], dict[int, str]]:
+    """Return the epochs to which seeds are asked for, and why others no longer are, by seed."""
+    asked, withdrawn = dict[int, int](), dict[int, str]()
+    genuine.require_no_link(store.path / FILE)
+    for line in read_records(store.path / FILE, RequestLine):
+        for seed in line.seeds:
+            most = asked.pop(seed, 0)
+            if line.withdrawn:
+                withdrawn[seed] = line.withdrawn
+            else:
+                asked[seed] = max(most, line.epochs)
+                withdrawn.pop(seed, None)
+    return asked, withdrawn
 
 
-def lines(store: EntryStore) -> list[RequestLine]:
-    """Return the lines of an entry's folder; none where there is no record."""
-    genuine.require_no_link(_path(store))
-    return read_records(_path(store), RequestLine)
+def add(store: EntryStore, seeds: Iterable[int], epochs: int = 0, **more: str) -> None:
+    """Record that seeds are asked for to some epochs (`code`), or why they no longer are (`withdrawn`).
+
+    The first request is for the seeds that are there, too.
+    """
+    with locked(store):
+        asked, withdrawn = read(store)
+        wanted = {*seeds, *(() if asked or not epochs else store.seeds())}
+        wanted = {seed for seed in wanted if seed < TUNING_SEEDS}
+        if any(
+            asked.get(seed, 0) < epochs or withdrawn.get(seed) != more.get("withdrawn") for seed in wanted
+        ):
+            now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+            drop_torn_line(store.path / FILE)
+            line = {"seeds": sorted(wanted), **({"epochs": epochs} if epochs else {}), **more, "time": now}
+            append(store.path / FILE, json_line(line))
 
 
-def read(store: EntryStore) -> Requests:
-    """Return the requests for an entry's seeds."""
-    return Requests.of(lines(store))
+def take_over(store: EntryStore, asked: Mapping[int, int], withdrawn: Mapping[int, str]) -> None:
+    """Record what `read` returned of another folder with seeds of the entry."""
+    for reason in dict.fromkeys(withdrawn.values()):
+        add(store, [seed for seed, why in withdrawn.items() if why == reason], withdrawn=reason)
+    for epochs in dict.fromkeys(asked.values()):
+        add(store, [seed for seed, most in asked.items() if most == epochs], epochs)
 
 
 def missing_text(store: EntryStore, missing: Sequence[int], total: int) -> str:
@@ -66,41 +72,3 @@ def missing_text(store: EntryStore, missing: Sequence[int], total: int) -> str:
         for what, count in parts.items()
         if count
     )
-
-
-def ask(store: EntryStore, seeds: Iterable[int], epochs: int, code: str) -> None:
-    """Record a request, if it asks for more than was asked for; the first one covers the seeds that are there."""
-    with locked(store):
-        asked = read(store).asked
-        wanted = {*seeds, *(() if asked else store.seeds())}
-        wanted = {seed for seed in wanted if seed < TUNING_SEEDS}
-        if any(asked.get(seed, 0) < epochs for seed in wanted):
-            _add(store, [RequestLine(seeds=sorted(wanted), epochs=epochs, code=code, time=_now())])
-
-
-def withdraw(store: EntryStore, seeds: Sequence[int], reason: str) -> None:
-    """Record that seeds are no longer asked for."""
-    with locked(store):
-        _add(store, [RequestLine(seeds=sorted(seeds), withdrawn=reason, time=_now())])
-
-
-def take_over(store: EntryStore, others: Sequence[RequestLine]) -> None:
-    """Record requests of another folder, with its seeds."""
-    with locked(store):
-        here = [line.content for line in lines(store)]
-        _add(store, [line for line in others if line.content not in here])
-
-
-def _add(store: EntryStore, new: Sequence[RequestLine]) -> None:
-    drop_torn_line(_path(store))
-    content = [json_line(line.content or line.model_dump(exclude_defaults=True)) for line in new]
-    if content:
-        append(_path(store), b"".join(content))
-
-
-def _path(store: EntryStore) -> Path:
-    return store.path / FILE
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

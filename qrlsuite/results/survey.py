@@ -20,9 +20,8 @@ from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, write_json
 from qrlsuite.results.text import duration
 
-STATUSES = ("finished", "running", "interrupted", "submitted", "damaged", "missing")
-"""Statuses of a seed. `submitted`: handed to a queue and not begun, according to our files or the queue. `missing`:
-asked for, and not there."""
+STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
+"""Statuses of a seed. `submitted`: handed to a queue and not begun, according to our files or the queue."""
 
 
 @dataclass(frozen=True)
@@ -136,12 +135,7 @@ def _seeds(
         elif seed not in held and statuses.get(seed) != "submitted":
             statuses[seed] = "interrupted"
     statuses |= {seed: "running" for seed in held if statuses.get(seed) != "finished"}
-    try:
-        asked = requests.read(store).asked
-    except StoreError as error:
-        problems.append(str(error))
-        return statuses, epochs
-    return {**dict.fromkeys(asked, "missing"), **statuses}, epochs
+    return statuses, epochs
 
 
 def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
@@ -351,14 +345,8 @@ def remove(items: Sequence[Garbage]) -> int:
     return freed
 
 
-def delete(
-    runs: Path,
-    store: EntryStore,
-    queued: Collection[int] | None = None,
-    seeds: Sequence[int] = (),
-    reason: str = "",
-) -> int:
-    """Delete an entry with all its seeds, or some of them; returns the bytes freed.
+def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None) -> int:
+    """Delete an entry with all its seeds; returns the bytes freed.
 
     Parameters
     ----------
@@ -366,8 +354,6 @@ def delete(
         The results folder. Targets of links out of it are not touched.
     queued:
         As for `look`.
-    seeds, reason:
-        The seeds, there or not, that are no longer asked for, and why; empty deletes all with the entry.
     """
     path = store.path
     if path.is_symlink() or path.parent.is_symlink() or path.resolve().parents[1] != runs.resolve():
@@ -379,8 +365,6 @@ def delete(
         raise StoreError(
             f"{path} waits in a queue ({waits[0].where}): cancel that first; nothing was deleted"
         )
-    if seeds:
-        return _withdraw(store, seeds, reason)
     size, _ = _usage(path)
     gone = path.with_name(f".deleted-{path.name}-{secrets.token_hex(4)}")
     move_away(store, gone)
@@ -392,19 +376,16 @@ def delete(
     return size
 
 
-def _withdraw(store: EntryStore, seeds: Sequence[int], reason: str) -> int:
-    """Record that seeds are no longer asked for, and delete what there is of them; returns the bytes freed."""
-    unknown = set(seeds) - {*requests.read(store).asked, *store.seeds()}
-    if unknown:
-        raise OptionError(
-            f"--seeds: {store.path} has no seeds {format_seeds(sorted(unknown))}, missing or not"
-        )
-    claim = acquire(store, seeds)
+def withdraw(store: EntryStore, seeds: Sequence[int], reason: str) -> int:
+    """Record why seeds, there or not, are no longer asked for, and delete them; returns the bytes freed."""
+    asked, _ = requests.read(store)
+    if unknown := sorted(set(seeds) - {*asked, *store.seeds()}):
+        raise OptionError(f"--seeds: {store.path} has no seeds {format_seeds(unknown)}, missing or not")
+    folders, claim = [store.seed(seed).path for seed in seeds], acquire(store, seeds)
+    freed = sum(_usage(folder)[0] for folder in folders)
     try:
-        requests.withdraw(store, seeds, reason)
-        freed = 0
-        for folder in (store.seed(seed).path for seed in seeds):
-            freed += _usage(folder)[0]
+        requests.add(store, seeds, withdrawn=reason)
+        for folder in folders:
             shutil.rmtree(folder, ignore_errors=True)
     finally:
         claim.release()

@@ -282,18 +282,14 @@ class Study:
                     hours[name] += run.seconds / 3600
                 else:
                     hours[name] += folder.seconds() / 3600
-        state = self.state(trained, hours, begun)
-        return replace(state, lost=self._lost(trained, self.looks.first_seed + max(state.taken, default=0)))
-
-    def _lost(self, trained: Mapping[str, Curves], end: int) -> dict[str, str]:
-        """Name the seeds before `end`, at which a look was taken, that were asked for and are not there."""
-        lost = dict[str, str]()
+        state, lost = self.state(trained, hours, begun), dict[str, str]()
+        end = self.looks.first_seed + max(state.taken, default=0)
         for name, entry in self.entries.items():
             store = EntryStore.find(self.folder, entry)
-            asked = [seed for seed in requests.read(store).asked if seed < end]
+            asked = [seed for seed in requests.read(store)[0] if seed < end]
             if missing := [seed for seed in asked if seed not in trained[name]]:
                 lost[name] = requests.missing_text(store, missing, len(asked))
-        return lost
+        return replace(state, lost=lost)
 
     def require_own(self, name: str, seed: int, study: str | None) -> None:
         """Refuse a seed of the block that another study, or none, has trained."""

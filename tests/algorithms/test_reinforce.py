@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.options import parse_setting
 from qrlsuite.plugins.algorithms import reinforce
 from qrlsuite.plugins.algorithms.reinforce import Reinforce, rewards_to_go
 from tests.algorithms.worlds import Clock, Contexts, Group, Perceptron, log_softmax
@@ -218,3 +220,20 @@ def test_training_samples_from_the_policy_and_validation_is_greedy() -> None:
     np.testing.assert_allclose(np.bincount(first, minlength=3) / 10_000, [0.7, 0.2, 0.1], atol=0.02)
     assert not np.array_equal(first, second)
     assert (made.act(np.zeros((1, 50, 4), dtype=np.float32)) == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("memory=400", []),
+        ("memory=399", ["memory=399 is too small for episodes of 500 steps: an update sees 499"]),
+        ("epochs_per_update=5", []),
+        (
+            "epochs_per_update=4",
+            ["epochs_per_update=4 is too small for episodes of 500 steps: an update sees 400"],
+        ),
+        ("environment.steps=700", ["memory=500 is too small for episodes of 700 steps: an update sees 600"]),
+    ],
+)
+def test_episodes_that_no_update_sees_whole_are_named(setting: str, said: list[str]) -> None:
+    assert resolve("cartpole", "mlp", "reinforce", [parse_setting(setting)]).unusable(100) == said

@@ -15,9 +15,11 @@ from qrlsuite.results.store import EntryStore
 from tests import commands
 from tests.conftest import results
 
+ENTRY = "mlp width=16"
 
-def words(task: Path, runs: Path, seeds: int, epochs: int, workers: int) -> list[str]:
-    command = ["run", "mlp width=16", "--task", str(task), "--seeds", str(seeds), "--epochs", str(epochs)]
+
+def words(task: Path, runs: Path, seeds: int, epochs: int, workers: int, trained: str) -> list[str]:
+    command = ["run", trained, "--task", str(task), "--seeds", str(seeds), "--epochs", str(epochs)]
     return [*command, "--workers", str(workers), "--runs", str(runs), "--json"]
 
 
@@ -54,11 +56,12 @@ def disturbed(
     epochs: int,
     workers: int,
     pause: float,
+    trained: str = ENTRY,
 ) -> Counter[str]:
     """Start the command again and again, killing it or a worker, until `kills` have hit or everything has finished."""
     killed: Counter[str] = Counter()
     while finished(runs, seeds, epochs) is None and killed["supervisor"] + killed["worker"] < kills:
-        run = commands.start(*words(task, runs, seeds, epochs, workers), env=environment())
+        run = commands.start(*words(task, runs, seeds, epochs, workers, trained), env=environment())
         killed["starts"] += 1
         while run.poll() is None and killed["supervisor"] + killed["worker"] < kills:
             while run.poll() is None and not training(runs) & set(children(run.pid)):
@@ -80,10 +83,10 @@ def disturbed(
     return killed
 
 
-def undisturbed(task: Path, runs: Path, seeds: int, epochs: int, workers: int) -> Path:
+def undisturbed(task: Path, runs: Path, seeds: int, epochs: int, workers: int, trained: str = ENTRY) -> Path:
     """Run the command to its end; returns the entry's folder."""
     while True:
-        assert commands.qrlsuite(*words(task, runs, seeds, epochs, workers)).returncode == 0
+        assert commands.qrlsuite(*words(task, runs, seeds, epochs, workers, trained)).returncode == 0
         entry = finished(runs, seeds, epochs)
         if entry is not None:  # else a worker of a killed command was still saving
             return entry

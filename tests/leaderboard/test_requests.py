@@ -91,7 +91,7 @@ def test_a_withdrawn_request_is_named_with_its_reason(runs: Path, tmp_path: Path
             say(*rm, text)
     with pytest.raises(OptionError, match="has no seeds 24:25"):
         say(*rm, "24:25 reason=x")
-    assert requests.read(store).asked.keys() == {*range(24)}
+    assert requests.read(store)[0].keys() == {*range(24)}
     say(*rm, "6,7 reason='the disk failed'")
     entry = api.load("mlp width=8", runs=runs)
     assert (entry.missing, 7 in entry.seeds) == ((), False)
@@ -116,13 +116,13 @@ def test_seeds_at_work_are_still_training(runs: Path) -> None:
     claim = claims.acquire(store, [6, 7])
     said = "2 of 24 seeds are still training; 1 of 24 seeds is missing: 9"
     assert api.load("mlp width=8", runs=runs).missing_text == said
-    assert look(store).seeds == {"finished": 21, "running": 2, "missing": 1}
+    assert look(store).seeds == {"finished": 21, "running": 2}
     claim.release()
 
 
 def test_a_run_that_was_stopped_is_provisional_until_it_is_continued(runs: Path) -> None:
     store = EntryStore.create(runs, resolve("tiny.toml", "mlp width=4"))
-    requests.ask(store, range(20), 3, "code")
+    requests.add(store, range(20), 3, code="code")
     train_group(store.path, range(20), 2)
     entry = api.load("mlp width=4", runs=runs)
     assert (entry.epochs, len(entry.seeds), len(entry.missing)) == (2, 20, 20)
@@ -155,7 +155,7 @@ def test_results_from_before_have_the_seeds_they_have_until_more_is_asked_for(ru
     (store.path / requests.FILE).unlink()
     assert not api.load("mlp width=8", runs=runs).missing
     api.train("tiny.toml", "mlp width=8", seeds=[0, 30], runs=runs, workers=1, progress=False)
-    assert requests.read(store).asked.keys() == {*range(24), 30} - {6}
+    assert requests.read(store)[0].keys() == {*range(24), 30} - {6}
 
 
 def test_parallel_requests_and_torn_lines_lose_nothing(runs: Path) -> None:
@@ -163,10 +163,10 @@ def test_parallel_requests_and_torn_lines_lose_nothing(runs: Path) -> None:
     with (store.path / requests.FILE).open("ab") as file:
         file.write(b'{"seeds":[1')
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda seed: requests.ask(store, [seed], 3, "code"), range(30, 50)))
-    assert requests.read(store).asked.keys() == {*range(24), *range(30, 50)}
-    assert requests.read(store).asked == dict.fromkeys(requests.read(store).asked, 3)
+        list(pool.map(lambda seed: requests.add(store, [seed], 3), range(30, 50)))
+    assert requests.read(store)[0].keys() == {*range(24), *range(30, 50)}
+    assert set(requests.read(store)[0].values()) == {3}
     before = (store.path / requests.FILE).read_bytes()
-    requests.ask(store, range(24), 2, "code")
-    requests.ask(store, [1_000_000], 2, "code")
+    requests.add(store, range(24), 2)
+    requests.add(store, [1_000_000], 2)
     assert (store.path / requests.FILE).read_bytes() == before, "nothing new was asked for"

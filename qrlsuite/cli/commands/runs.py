@@ -18,7 +18,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.notation import parse_named
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds, parse_seeds
-from qrlsuite.results.survey import STATUSES, EntrySurvey, garbage, remove
+from qrlsuite.results.store import EntryStore
+from qrlsuite.results.survey import STATUSES, EntrySurvey, garbage, remove, withdraw
 from qrlsuite.results.text import counted, duration, size_text
 
 app = typer.Typer(invoke_without_command=True)
@@ -143,7 +144,7 @@ def delete_entries(
     Examples: qrlsuite runs rm "mlp width=64" --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
     --seeds "6,18 reason='the disk failed'"
     """
-    withdrawn = () if seeds is None else _withdrawn(seeds)
+    withdrawn = None if seeds is None else _withdrawn(seeds)
     chosen = choose(runs, names, task)
     for entry in chosen:
         description = (
@@ -154,7 +155,10 @@ def delete_entries(
     if not yes and not typer.confirm("Delete this for good?", err=json_output):
         typer.echo("nothing was deleted", err=json_output)
         raise typer.Exit(1)
-    freed = delete_each(runs, chosen, *withdrawn)
+    if withdrawn is None:
+        freed = delete_each(runs, chosen)
+    else:
+        freed = sum(withdraw(EntryStore(entry.folder), *withdrawn) for entry in chosen)
     if json_output:
         rows = [{"task": entry.task, "entry": entry.name, "size": entry.size} for entry in chosen]
         typer.echo(json.dumps({"deleted": rows, "freed": freed}))
@@ -165,10 +169,11 @@ def delete_entries(
 def _withdrawn(text: str) -> tuple[list[int], str]:
     """Read seeds that are no longer asked for, and the reason."""
     seeds, more = parse_named(text, "--seeds ")
-    if set(more) != {"reason"} or not str(more["reason"]).strip() or not str(more["reason"]).isprintable():
+    reason = str(more.get("reason", "")).strip()
+    if set(more) - {"reason"} or not reason or not reason.isprintable() or len(reason) > 300:
         example = "--seeds \"6,18 reason='the disk failed'\""
-        raise OptionError(f"--seeds {text}: say why, in one line, for example {example}")
-    return parse_seeds(seeds), str(more["reason"]).strip()[:300]
+        raise OptionError(f"--seeds {text}: give a reason, in one line, for example {example}")
+    return parse_seeds(seeds), reason
 
 
 def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
