@@ -565,7 +565,7 @@ class EntryResults(Shown):
             return []
         protocol, trained = self.task_file.protocol, max(run.epochs for run in self.records.values())
         try:
-            episode = specs.most_steps(self.record.identity.task["environment_options"])
+            episode = specs.most_steps(self.record.identity.task.get("environment_options", {}))
             judge, own = specs.resolve(reference), {**self.options["algorithm"], "episode": episode}
             return list(judge(own, trained, protocol.rounds, protocol.environments))
         except KeyError:

@@ -294,8 +294,9 @@ class State(Shown):
             f"seeds {format_seeds(section.block)}; any false difference with probability {section.alpha:g} "
             f"({counted(family, 'pair')}, {section.spending} spending); equal within {100 * section.margin:g} percent"
         )
-        for name, entry in study.entries.items():
-            yield from (f"note: {name}: {line}" for line in entry.unusable(study.epochs))
+        unusable = {name: entry.unusable(study.epochs) for name, entry in study.entries.items()}
+        for line in dict.fromkeys(line for lines in unusable.values() for line in lines):
+            yield f"note: {line}: {', '.join(name for name, lines in unusable.items() if line in lines)}"
         for level in self.levels():
             equal = "" if level["equal"] is None else f"; equal at p <= {level['equal']:.4f} on both sides"
             yield (
