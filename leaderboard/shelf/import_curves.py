@@ -36,15 +36,13 @@ from qrlsuite.results import provenance, run_files
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.genuine import require_no_link
 from qrlsuite.results.points import Points, Run
-from qrlsuite.results.records import EntryRecord, ImportedRecord, RunRecord
+from qrlsuite.results.records import EntryRecord, ImportedRecord
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import (
     EntryStore,
     SeedStore,
     entries,
     round_means,
-    table_bytes,
-    write_atomically,
 )
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
@@ -488,38 +486,16 @@ def _write(
 def _write_seed(
     curve: NDArray[np.float64], record: EntryRecord, own: Points, early: str | None, made: SeedStore
 ) -> None:
-    made.path.mkdir(parents=True)
-    rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(curve, start=1)]
-    write_atomically(made.table, table_bytes(rows))
-    made.write_record(
-        RunRecord.model_validate(
-            {
-                "task": record.task_name,
-                "task_hash": record.task_hash,
-                "entry": record.name,
-                "label": record.label,
-                "algorithm": EXTERNAL,
-                "model": record.identity.model,
-                "parameters": {},
-                "seed": made.seed,
-                "interactions_per_epoch": record.task_file.protocol.interactions,
-                "status": "finished",
-                "epochs": len(rows),
-                "imported": {
-                    "file": printable(own.source),
-                    "points": len(own.steps),
-                    "first_step": int(own.steps[0]),
-                    "last_step": int(own.steps[-1]),
-                    **(
-                        {"early": early}
-                        if int(own.steps[-1]) // record.task_file.protocol.interactions < len(curve)
-                        else {}
-                    ),
-                },
-                "provenance": [{"imported_with": provenance.collect([]).versions}],
-            }
-        )
-    )
+    last = int(own.steps[-1])
+    origin = {
+        "file": printable(own.source),
+        "points": len(own.steps),
+        "first_step": int(own.steps[0]),
+        "last_step": last,
+        **({"early": early} if last // record.task_file.protocol.interactions < len(curve) else {}),
+    }
+    made_with = {"imported_with": provenance.collect([]).versions}
+    made.write_curve(record, curve, imported=origin, provenance=[made_with])
 
 
 def _notation_of(entry: str) -> tuple[str, dict[str, Any]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import datetime
+import json
 import os
 import resource
 import shlex
@@ -18,7 +19,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -38,13 +39,11 @@ from qrlsuite.experiment.task import Task
 from qrlsuite.results import codes, points, provenance
 from qrlsuite.results.points import Points
 from qrlsuite.results.progress import Progress, most_memory
-from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import (
     EntryStore,
     SeedStore,
     json_line,
     round_means,
-    table_bytes,
     write_atomically,
 )
 from qrlsuite.training.interrupts import Interruptible
@@ -86,9 +85,9 @@ def words(entry: Entry) -> list[str]:
     return ["--script", json_line(values).decode().strip()]
 
 
-def read(values: Mapping[str, Any], store: EntryStore) -> Entry:
+def _read(text: str, store: EntryStore) -> Entry:
     """Return the entry that a worker's command line hands over; its folder's record has to be that entry's."""
-    record = store.record()
+    values, record = json.loads(text), store.record()
     task = Task(record.task_file, str(store.path))
     given = {name: value for name, value in values.items() if name != "folder"}
     entry = of_script(task, record.identity.model, scripts.build(record.identity.model, given))
@@ -98,24 +97,28 @@ def read(values: Mapping[str, Any], store: EntryStore) -> Entry:
 
 
 def train(
-    entry: Entry, store: EntryStore, seed: int, output: Path, progress: Progress, report: Report
+    started: str, store: EntryStore, seeds: Sequence[int], output: Path, progress: Progress, report: Report
 ) -> None:
-    """Start the command for a seed, follow its curve, and store that; with the files that are there now.
+    """Start the command for each unfinished seed, follow its curve, and store that; with the files that are there now.
 
     Parameters
     ----------
+    started:
+        What `words` wrote.
     output:
         The file for all that the command prints.
     """
-    if store.finished([seed], entry.epochs):
-        return
-    code = identity.of(entry)
-    codes.require(store, code, socket.gethostname())
-    run, before = _Run(entry, seed, output), resource.getrusage(resource.RUSAGE_CHILDREN)
-    run.follow(progress, report)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    _store(entry, store, seed, code, *run.curve(), cpu)
+    entry = _read(started, store)
+    progress.phase, progress.size = "training", len(seeds)
+    for seed in sorted({*seeds} - store.finished(seeds, entry.epochs)):
+        code = identity.of(entry)
+        codes.require(store, code, socket.gethostname())
+        run, before = _Run(entry, seed, output), resource.getrusage(resource.RUSAGE_CHILDREN)
+        report(progress)
+        run.follow(progress, report)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        _store(entry, store, seed, code, *run.curve(), cpu)
 
 
 class _Run:
@@ -274,34 +277,18 @@ def _store(
     cpu: float,
 ) -> None:
     """Put a seed into its place, whole or not at all."""
-    place, record = store.seed(seed).path, store.record()
+    place = store.seed(seed).path
     made = SeedStore(place.with_name(f".{place.name}.made"), seed)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    run = {
-        **({} if entry.study is None else {"plan": entry.study}),
-        "task": record.task_name,
-        "task_hash": record.task_hash,
-        "entry": record.name,
-        "label": record.label,
-        "algorithm": SCRIPT,
-        "model": entry.model.name,
-        "seed": seed,
-        "interactions_per_epoch": entry.task.file.protocol.interactions,
-        "status": "finished",
-        "epochs": len(scores),
-        "code": code.record(),
-        "imported": origin,
-        "agent": False,
-        "provenance": [provenance.collect([]).content],
-    }
+    facts = {"code": code.record(), "imported": origin, "agent": False}
+    planned = {} if entry.study is None else {"plan": entry.study}
     try:
         shutil.rmtree(made.path, ignore_errors=True)
-        made.path.mkdir(parents=True)
-        rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(scores, start=1)]
-        write_atomically(made.table, table_bytes(rows))
-        times = {"epoch": len(rows), "cpu": cpu, "host": socket.gethostname(), "time": now}
+        made.write_curve(
+            store.record(), scores, **planned, **facts, provenance=[provenance.collect([]).content]
+        )
+        times = {"epoch": len(scores), "cpu": cpu, "host": socket.gethostname(), "time": now}
         write_atomically(made.timings, json_line(times))
-        made.write_record(RunRecord.model_validate(run))
         made.path.rename(place)
     except OSError as error:
         raise StoreError(f"cannot write {place}: {error.strerror or error}") from None

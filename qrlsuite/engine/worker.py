@@ -15,7 +15,6 @@ import contextlib
 import ctypes
 import gc
 import itertools
-import json
 import os
 import signal
 import sys
@@ -67,6 +66,7 @@ def train_group(
     device: str = "cpu",
     parent: int | None = None,
     others: Sequence[Path] = (),
+    started: str | None = None,
 ) -> None:
     """Claim seeds and train the unfinished ones in this process.
 
@@ -79,9 +79,9 @@ def train_group(
         The process without which this one shall not go on.
     others:
         Folders of further entries whose seeds are trained in the same population.
+    started:
+        The command that trains a script's seeds one after the other, see `qrlsuite.engine.script.words`.
     """
-    from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
-
     claims: list[Claim] = []
     heartbeat = ClaimHeartbeat(claims, parent)
     heartbeat.start()
@@ -108,7 +108,11 @@ def train_group(
             except SeedsClaimedError as error:
                 taken = error
                 continue
-            files[store.path] = ProgressFile(store, group_id(seeds))
+            file = files[store.path] = ProgressFile(store, group_id(seeds))
+            if started is not None:
+                places[store.path] = slice(None)
+                script.train(started, store, seeds, file.path.with_name("output.txt"), state, report)
+                continue
             probes.require_independent(store)
             for group in plan_groups(store, seeds, epochs, workers=1):
                 parts.setdefault(group.epoch, []).append((store.entry(), store, group.seeds))
@@ -120,6 +124,8 @@ def train_group(
             probe = probing.prepare(together, epochs, device)
             if probe is not None:
                 claims.append(probe.claim)
+            from qrlsuite.training.group import GroupRun  # torch, which scripts and a supervisor do without
+
             run = GroupRun(together, epochs, device, report, held, probe)
             run.progress.size, run.progress.untried = state.size, state.untried
             run.progress.turn, run.progress.turns = turn, len(pieces)
@@ -160,36 +166,6 @@ def divided(parts: Sequence[Part], size: int) -> Iterator[list[Part]]:
     for low in range(0, len(rest), size):
         piece = itertools.groupby(rest[low : low + size], key=lambda each: each[0])
         yield [(*parts[place][:2], [seed for _, seed in its]) for place, its in piece]
-
-
-def train_script(folder: Path, seeds: Sequence[int], started: str, parent: int | None = None) -> None:
-    """Claim seeds and have a command train the unfinished ones, one after the other.
-
-    Parameters
-    ----------
-    started:
-        What to start, from the command line of this process: see `qrlsuite.engine.script.words`.
-    """
-    store = EntryStore(folder)
-    claim = acquire(store, seeds)
-    heartbeat = ClaimHeartbeat([claim], parent)
-    heartbeat.start()
-    file, state = ProgressFile(store, group_id(seeds)), Progress(phase="training", size=len(seeds))
-    try:
-        entry = script.read(json.loads(started), store)
-        state.epochs = entry.epochs
-        file.write(state, force=True)
-        for seed in seeds:
-            script.train(entry, store, seed, file.path.with_name("output.txt"), state, file.write)
-        state.phase, state.epoch = "finished", entry.epochs
-        file.write(state, force=True)
-    except QrlSuiteError as error:
-        with contextlib.suppress(StoreError):
-            file.write(state, str(error), force=True)
-        raise
-    finally:
-        heartbeat.stopped.set()
-        claim.release()
 
 
 def _stop_others(claims: Sequence[Claim]) -> None:
@@ -262,13 +238,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         folder, *others = options.folders
         seeds, parent = parse_seeds(options.seeds), options.follow_parent
-        if options.script is not None:
-            train_script(folder, seeds, options.script, parent)
-            return 0
-        _import_training()
-        for path in options.folders:
-            codes.load_copies(EntryStore(path))
-        train_group(folder, seeds, options.epochs, options.device, parent, others)
+        if options.script is None:
+            _import_training()
+            for path in options.folders:
+                codes.load_copies(EntryStore(path))
+        train_group(folder, seeds, options.epochs, options.device, parent, others, options.script)
     except SeedsClaimedError as error:
         print(f"qrlsuite: {error}", file=sys.stderr)
         return 3

@@ -230,7 +230,8 @@ def resolve(
     if written.algorithm == SCRIPT:
         if written.preset is not None or written.start is not None:
             raise OptionError(f"script '{written.model}' has no preset, and no agents to begin with")
-        return of_script(task, written.model, scripts.read(written.model, written.settings))
+        values = {each.full_name.removeprefix("algorithm."): each.value for each in written.settings}
+        return of_script(task, written.model, scripts.build(written.model, values))
     task = task if isinstance(task, Task) else load(task)
     model = registry.get(specs.ModelSpec, written.model)
     file = _preset_file(written)

@@ -23,7 +23,6 @@ from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError
 from qrlsuite.experiment import source, task
 from qrlsuite.experiment.task import EXTERNAL, Task
-from qrlsuite.options import Setting
 from qrlsuite.statistics.grid import Goal
 
 SCRIPT = "script"
@@ -111,18 +110,8 @@ def kind_of(metric: str) -> str:
     return "training-mean" if metric.startswith("rollout/") else "training"
 
 
-def read(name: str, settings: Sequence[Setting]) -> Script:
-    """Return the options that were written for the script of a name."""
-    for each in settings:
-        if each.side not in (None, "algorithm"):
-            raise OptionError(
-                f"{each.written}: a script has no options of its {each.side}: add them to its command"
-            )
-    return build(name, {each.name: each.value for each in settings})
-
-
 def build(name: str, values: Mapping[str, Any]) -> Script:
-    """Return options from their values by name."""
+    """Return the options of the script of a name."""
     if "command" not in values:
         example = f'{SCRIPT} {name} command="python {name}.py --seed {{seed}} --total-timesteps {{steps}}"'
         raise OptionError(f"script '{name}' needs its command here, for example: {example}")
@@ -133,12 +122,10 @@ def build(name: str, values: Mapping[str, Any]) -> Script:
 def parts(name: str) -> tuple[specs.AlgorithmSpec, specs.ModelSpec]:
     """Return specs that stand for a script's algorithm and model."""
     try:
-        return (
-            specs.AlgorithmSpec(SCRIPT, "A command that trains one seed", f"{__name__}:Script", ""),
-            specs.ModelSpec(name, "A script", "classical", "qrlsuite.experiment.task:Nothing", ""),
-        )
+        model = specs.ModelSpec(name, "A script", "classical", "qrlsuite.experiment.task:Nothing", "")
     except PluginError as error:
         raise OptionError(str(error)) from None
+    return specs.AlgorithmSpec(SCRIPT, "A command that trains one seed", f"{__name__}:Script", ""), model
 
 
 def place(name: str | Task, script: Script) -> tuple[Task, Script]:

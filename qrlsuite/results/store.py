@@ -330,6 +330,35 @@ class SeedStore:
         """Replace `run.json`."""
         write_json(self.path / "run.json", record.content)
 
+    def write_curve(self, record: EntryRecord, scores: NDArray[np.float64], **facts: Any) -> None:
+        """Write the finished run of another program into an empty folder.
+
+        Parameters
+        ----------
+        scores:
+            (T,): the score of every epoch.
+        facts:
+            Further keys of `run.json`.
+        """
+        self.path.mkdir(parents=True)
+        rows = [{"epoch": epoch, "score": float(score)} for epoch, score in enumerate(scores, start=1)]
+        write_atomically(self.table, table_bytes(rows))
+        content = {
+            "task": record.task_name,
+            "task_hash": record.task_hash,
+            "entry": record.name,
+            "label": record.label,
+            "algorithm": record.identity.algorithm,
+            "model": record.identity.model,
+            "parameters": {},
+            "seed": self.seed,
+            "interactions_per_epoch": record.task_file.protocol.interactions,
+            "status": "finished",
+            "epochs": len(rows),
+            **facts,
+        }
+        self.write_record(RunRecord.model_validate(content))
+
     def trained_epochs(self) -> int:
         """Return the epochs of the run; 0 where it never began."""
         record = self.record()

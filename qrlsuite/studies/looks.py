@@ -158,7 +158,7 @@ class Study:
         """Refuse a study that changed after it began, or whose seeds were trained before; return whether it began."""
         if not self.begun:
             for table, (name, entry) in zip(self.file.entries, self.entries.items()):
-                if table.code not in (None, code_of(entry)):
+                if _has_other_code(table, entry):
                     raise OptionError(f"{self.source}: {self._other_code(name)}")
             for name, seeds, path in self.trained_before():
                 raise OptionError(
@@ -245,7 +245,7 @@ class Study:
         for table, (name, entry) in zip(self.file.entries, self.entries.items()):
             store = EntryStore.find(self.folder, entry)
             begun = store.path.is_dir() and bool(store.seeds())
-            if not begun and table.code not in (None, code_of(entry)):
+            if not begun and _has_other_code(table, entry):
                 raise OptionError(f"{self.source}: {self._other_code(name)}")
 
     @staticmethod
@@ -524,6 +524,12 @@ def _fixed_table(member: Member, named: bool) -> EntriesSection:
 def code_of(entry: Entry) -> str | None:
     """Return the digest of an entry's code where a plugin's is among it; None where all is the suite's."""
     return identity.of(entry).digest if entry.third_party() else None
+
+
+def _has_other_code(table: EntriesSection, entry: Entry) -> bool:
+    """Return whether an entry's code has changed; a script that was found in a folder has none here."""
+    found = entry.script is not None and entry.folder is None
+    return not found and table.code not in (None, code_of(entry))
 
 
 def _with_code_of(file: StudyFile, kept: StudyFile) -> StudyFile:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import itertools
 import json
 import os
 import shutil
@@ -122,8 +123,14 @@ def kill(moment: str, run: commands.Command, folder: Path, runs: Path) -> None:
         )
 
 
-@pytest.mark.parametrize("moment", ["script", "worker", "Ctrl-C", "command", "SIGTERM"])
-@pytest.mark.parametrize("lines", [1, 5, 10])
+MOMENTS = ("script", "worker", "Ctrl-C", "command", "SIGTERM")
+SMALL = list(zip(MOMENTS, (1, 5, 10, 5, 10)))
+REST = [pair for pair in itertools.product(MOMENTS, (1, 5, 10)) if pair not in SMALL]
+
+
+@pytest.mark.parametrize(
+    ("moment", "lines"), SMALL + [pytest.param(*pair, marks=pytest.mark.long) for pair in REST]
+)
 def test_a_killed_seed_begins_again_and_none_is_lost_or_doubled(moment: str, lines: int, walk: Path) -> None:
     """At the first line, amid the curve, and when it is whole but the script has not ended."""
     runs = walk / "results"
@@ -222,7 +229,10 @@ reason = "a test"
     assert commands.qrlsuite(*words()).returncode == 0
     begun = {path: path.read_text() for path in walk.glob("starts-*.txt")}
     assert len(begun) == 7
-    assert commands.qrlsuite("export", "walk", "--out", "out").returncode == 0
+    for exported in ("walk", "walks.toml"):
+        assert commands.qrlsuite("export", exported, "--out", "out").returncode == 0
+    assert commands.qrlsuite("import", "out/walks", "--runs", "third").returncode == 0
+    assert "found in a results folder" in commands.qrlsuite("study", "run", "out/walks").stderr
     store = the_entry(walk / "runs")
     shutil.rmtree(store.seed(0).path)
     shutil.rmtree(next(walk.glob("runs/decisions/walks/*/*/seed-10001")))
@@ -231,7 +241,8 @@ reason = "a test"
         engine_script.words(kept)
     worker = ["--seeds", "0:1", "--epochs", "5"]
     assert commands.start_worker(str(store.path), *worker).wait() == 2
-    other = {"folder": str(walk), "command": "touch pwned-{seed}", "steps": 100, "curve": "curve-{seed}.csv"}
+    command = f"{sys.executable} walk.py {{seed}} {{steps}} 0.5"  # of the same files
+    other = {"folder": str(walk), "command": command, "steps": 100, "curve": "curve-{seed}.csv"}
     assert commands.start_worker(str(store.path), *worker, "--script", json.dumps(other)).wait() == 2
     assert "found in a results folder" in commands.qrlsuite("study", "run", "runs/decisions/walks").stderr
     for typed in (
