@@ -13,7 +13,7 @@ from qrlsuite import api
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
-from qrlsuite.experiment.entry import EXTERNAL
+from qrlsuite.experiment.task import EXTERNAL
 from qrlsuite.leaderboard.shelf import import_curves, import_seeds, published_studies
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.results import run_files
