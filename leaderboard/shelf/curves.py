@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow
 from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
@@ -24,7 +23,7 @@ from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import codes, probes, provenance, requests
-from qrlsuite.results.records import MEASURED, EntryRecord, Provenance, RunRecord
+from qrlsuite.results.records import EntryRecord, Provenance, RunRecord
 from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, parameters_of
 from qrlsuite.results.text import counted, hours_text
@@ -429,26 +428,6 @@ class EntryResults(Shown):
         """The seeds with agents whose numbers were not finite within the curves' epochs."""
         first = {seed: self.records[seed].diverged for seed in self.seeds}
         return tuple(seed for seed, epoch in first.items() if epoch and epoch <= self.epochs)
-
-    def to_table(self) -> pyarrow.Table:
-        """Return the curves as an Arrow table of N x T rows, seed by seed: `to_pandas()`, or `polars.from_arrow`.
-
-        Its columns are `task`, `entry` (the label), `seed`, `epoch` (from 1), `steps` (environment steps at the end
-        of the epoch), `score` (mean validation score after it), and `measured.NAME` for each metric of the environment.
-        """
-        n_runs, epochs = self.curves.shape
-        epoch = np.tile(np.arange(1, epochs + 1), n_runs)
-        return pyarrow.table(
-            {
-                "task": pyarrow.repeat(self.task, n_runs * epochs),
-                "entry": pyarrow.repeat(self.label, n_runs * epochs),
-                "seed": np.repeat(np.array(self.seeds, dtype=np.int64), epochs),
-                "epoch": epoch,
-                "steps": epoch * self.steps_per_epoch,
-                "score": self.curves.ravel(),
-                **{f"{MEASURED}.{name}": values.ravel() for name, values in self.metrics.items()},
-            }
-        )
 
     @property
     def facts(self) -> dict[str, str]:

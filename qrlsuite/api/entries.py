@@ -54,7 +54,7 @@ def load(
     EntryResults
         With `curves` of shape (N, T): the mean validation score of N seeds after each of T epochs, in the task's
         units ([0, 1] where scores are fractions of the optimum); `steps_per_epoch` environment steps each;
-        `records` by seed; `to_table()` for pandas and polars.
+        `records` by seed; `table("epochs", entries=[results])` for pandas and polars.
 
     Raises
     ------
