@@ -227,7 +227,9 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
     """Return the notes on entries that may turn a verdict: these stand first."""
     notes = {
         "curves that other programs made, and nobody here can train or check again": {
-            entry.label: "" for entry in entries if entry.external and entry.algorithm != SCRIPT
+            entry.label: entry.ended_early
+            for entry in entries
+            if entry.external and entry.algorithm != SCRIPT
         },
         "trained by scripts, which `qrlsuite verify` cannot train again": {
             entry.label: "" for entry in entries if entry.algorithm == SCRIPT

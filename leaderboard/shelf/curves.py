@@ -209,6 +209,15 @@ class EntryResults(Shown):
         return "by a script, not repeatable here" if self.algorithm == SCRIPT else "by another program"
 
     @property
+    def ended_early(self) -> str:
+        """How many imported runs end before the others, and what they were taken for; empty for none."""
+        said = [run.imported.get("early") for run in self._run_records]
+        taken = [(said.count(word), word) for word in ("solved", "failed") if word in said]
+        return ", ".join(
+            f"{counted(count, 'seed')} that ended early taken as {word}" for count, word in taken
+        )
+
+    @property
     def first_thresholds(self) -> tuple[float, ...] | None:
         """The thresholds in force when its first seed was trained; None where the record does not say."""
         return self.record.task_file.ranking.grid.thresholds

@@ -103,6 +103,9 @@ def test_runs_that_end_early_are_what_the_user_says(tmp_path: Path) -> None:
     curves, notes = take("failed")
     assert curves == [*whole, [12, 22, 10], [10, 10, 10]], "the worst score, at which no threshold is reached"
     assert "'a': seeds 2:4 end early: they crashed or never learned" in notes[0]
+    assert (
+        api.load("a", runs=tmp_path / "runs-failed").ended_early == "2 seeds that ended early taken as failed"
+    )
     record = api.load("a", runs=tmp_path / "runs-failed").records[3].record
     assert record is not None
     assert record.imported["early"] == "failed"
@@ -138,6 +141,12 @@ def test_one_score_for_all_entries(sb3: Path, tmp_path: Path) -> None:
     said = "score of 'large' is rollout/ep_rew_mean, that of 'small' eval/mean_reward: curves of different scores"
     with pytest.raises(QrlSuiteError, match=said):
         api.import_curves([one, other], maximum=500, units="same", runs=tmp_path)
+    for seed, column in enumerate(("score", "charts/episodic_return")):
+        (tmp_path / f"{seed}.csv").write_text(f"entry,seed,step,{column}\na,{seed},10,3\n")
+    with pytest.raises(
+        QrlSuiteError, match="score of 'a' is charts/episodic_return, in another file score: curves"
+    ):
+        api.import_curves([tmp_path / "0.csv", tmp_path / "1.csv"], maximum=500, runs=tmp_path)
     [small] = api.import_curves([one], maximum=500, runs=tmp_path)
     assert small.store.record().imported.metric == "eval/mean_reward"  # type: ignore[union-attr]
     with pytest.raises(QrlSuiteError, match="that of 'external small', imported before, eval/mean_reward"):
