@@ -11,7 +11,6 @@ import ctypes
 import datetime
 import json
 import os
-import resource
 import shlex
 import shutil
 import signal
@@ -19,7 +18,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -39,13 +38,8 @@ from qrlsuite.experiment.task import Task
 from qrlsuite.results import codes, points, provenance
 from qrlsuite.results.points import Points
 from qrlsuite.results.progress import Progress, most_memory
-from qrlsuite.results.store import (
-    EntryStore,
-    SeedStore,
-    json_line,
-    round_means,
-    write_atomically,
-)
+from qrlsuite.results.store import EntryStore, SeedStore, json_line, write_atomically
+from qrlsuite.statistics.grid import settled
 from qrlsuite.training.interrupts import Interruptible
 
 LOOK_SECONDS = 1.0
@@ -113,12 +107,13 @@ def train(
     for seed in sorted({*seeds} - store.finished(seeds, entry.epochs)):
         code = identity.of(entry)
         codes.require(store, code, socket.gethostname())
-        run, before = _Run(entry, seed, output), resource.getrusage(resource.RUSAGE_CHILDREN)
+        run, before = _Run(entry, seed, output), os.times()
+        progress.epoch = 0
         report(progress)
         run.follow(progress, report)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        _store(entry, store, seed, code, *run.curve(), cpu)
+        after = os.times()
+        cpu = after.children_user + after.children_system - before.children_user - before.children_system
+        run.save(store, code, cpu)
 
 
 class _Run:
@@ -127,9 +122,10 @@ class _Run:
     def __init__(self, entry: Entry, seed: int, output: Path) -> None:
         assert entry.script is not None
         assert entry.folder is not None
-        self.script, self.folder, self.seed, self.output = entry.script, entry.folder, seed, output
-        self.file, self.epochs = entry.task.file, entry.epochs
+        self.entry, self.script, self.folder = entry, entry.script, entry.folder
+        self.seed, self.output, self.file = seed, output, entry.task.file
         self.words = self.script.words(seed)
+        self.told = f"seed {seed}: {shlex.join(self.words)}"
         self._before = self._files()
 
     def _files(self) -> dict[Path, tuple[int, int]]:
@@ -169,11 +165,6 @@ class _Run:
                 f"printed: {self.output})"
             )
 
-    @property
-    def told(self) -> str:
-        """The seed and the command, for messages."""
-        return f"seed {self.seed}: {shlex.join(self.words)}"
-
     def _look(self, progress: Progress, seconds: float) -> None:
         """Take in how far the curve is; a file that is just being written may not be read."""
         try:
@@ -182,7 +173,7 @@ class _Run:
             return
         every = self.file.protocol.interactions
         self._require_begun(found)
-        epoch = min(int(found.steps[-1]) // every, self.epochs)
+        epoch = min(int(found.steps[-1]) // every, self.entry.epochs)
         if epoch > progress.epoch:
             progress.epoch_seconds = seconds / epoch
             progress.finished_epoch(epoch, [float(self._scores(found.scores[-1:])[0])], [False])
@@ -211,7 +202,7 @@ class _Run:
     def _scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return scores in the unit of the task: fractions of the best one where it has one."""
         best = 1.0 if self.file.ranking.thresholds is not None else self.file.score.max_return or 1.0
-        scores = round_means(values / best)
+        scores = settled(values / best)
         if self.file.ranking.thresholds is None and not ((scores > -1e-6) & (scores < 1 + 1e-6)).all():
             raise QrlSuiteError(
                 f"{self.told}: its scores go from {values.min():g} to {values.max():g}, and those of the task from 0 "
@@ -219,11 +210,11 @@ class _Run:
             )
         return scores
 
-    def curve(self) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    def _curve(self) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """Return the scores after each epoch (T,), each the last at or before its end; and from what they are."""
         found, every = self._points(), self.file.protocol.interactions
         self._require_begun(found)
-        last, steps = int(found.steps[-1]), every * self.epochs
+        last, steps = int(found.steps[-1]), every * self.entry.epochs
         if last < (1 - REST) * steps:
             raise QrlSuiteError(
                 f"{self.told}: its curve ends at step {last} of {steps}: nobody knows the scores after it. If a run is "
@@ -233,10 +224,28 @@ class _Run:
             raise QrlSuiteError(
                 f"{self.told}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME"
             )
-        grid = every * np.arange(1, self.epochs + 1)
+        grid = every * np.arange(1, self.entry.epochs + 1)
         scores = self._scores(found.scores[np.searchsorted(found.steps, grid, side="right") - 1])
         origin = {"file": printable(found.source), "points": len(found.steps), "last_step": last}
         return scores, {**origin, "command": shlex.join(self.words)}
+
+    def save(self, store: EntryStore, code: CodeIdentity, cpu: float) -> None:
+        """Put the seed into its place, whole or not at all."""
+        scores, origin = self._curve()
+        place = store.seed(self.seed).path
+        made = SeedStore(place.with_name(f".{place.name}.made"), self.seed)
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        made_with = [provenance.collect([]).content]
+        facts = {"code": code.record(), "imported": origin, "agent": False, "provenance": made_with}
+        planned = {} if self.entry.study is None else {"plan": self.entry.study}
+        try:
+            shutil.rmtree(made.path, ignore_errors=True)
+            made.write_curve(store.record(), scores, **planned, **facts)
+            times = {"epoch": len(scores), "cpu": cpu, "host": socket.gethostname(), "time": now}
+            write_atomically(made.timings, json_line(times))
+            made.path.rename(place)
+        except OSError as error:
+            raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
 
 
 def _start(command: list[str], folder: Path, output: IO[bytes]) -> subprocess.Popen[bytes]:
@@ -265,30 +274,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(process.pid, number)
                 process.wait(PATIENCE)
-
-
-def _store(
-    entry: Entry,
-    store: EntryStore,
-    seed: int,
-    code: CodeIdentity,
-    scores: NDArray[np.float64],
-    origin: Mapping[str, Any],
-    cpu: float,
-) -> None:
-    """Put a seed into its place, whole or not at all."""
-    place = store.seed(seed).path
-    made = SeedStore(place.with_name(f".{place.name}.made"), seed)
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    facts = {"code": code.record(), "imported": origin, "agent": False}
-    planned = {} if entry.study is None else {"plan": entry.study}
-    try:
-        shutil.rmtree(made.path, ignore_errors=True)
-        made.write_curve(
-            store.record(), scores, **planned, **facts, provenance=[provenance.collect([]).content]
-        )
-        times = {"epoch": len(scores), "cpu": cpu, "host": socket.gethostname(), "time": now}
-        write_atomically(made.timings, json_line(times))
-        made.path.rename(place)
-    except OSError as error:
-        raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
