@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -30,25 +29,15 @@ from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import write_atomically
 
-
-class Format(StrEnum):
-    """How a leaderboard is written."""
-
-    table = "table"
-    markdown = "markdown"
-    json = "json"
-    csv = "csv"
-    html = "html"
-    latex = "latex"
-
-
-ENDINGS = {
-    ".html": Format.html,
-    ".tex": Format.latex,
-    ".md": Format.markdown,
-    ".csv": Format.csv,
-    ".json": Format.json,
+Format = Literal["table", "markdown", "json", "csv", "html", "latex"]
+ENDINGS: dict[str, Format] = {
+    ".html": "html",
+    ".tex": "latex",
+    ".md": "markdown",
+    ".csv": "csv",
+    ".json": "json",
 }
+"""Formats by the ending of a file."""
 
 
 def leaderboard(
@@ -64,7 +53,7 @@ def leaderboard(
         ),
     ] = None,
     horizon: HorizonOption = None,
-    format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
+    format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = "table",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -130,7 +119,7 @@ def leaderboard(
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
     format_ = format_ if output is None else ENDINGS.get(output.suffix, format_)
-    if output is not None and format_ is Format.table:
+    if output is not None and format_ == "table":
         raise OptionError(f"--out {output}: end it with {', '.join(ENDINGS)}")
     tasks = list(task or ())
 
@@ -144,7 +133,7 @@ def leaderboard(
         "all_codes": all_codes,
         "labels": label or (),
     }
-    if format_ is Format.html:
+    if format_ == "html":
         path, refused = write_page(output, Selection.create(runs, tasks, published), **asked)
         _left_out(refused)
         if path is None:
@@ -152,11 +141,11 @@ def leaderboard(
         typer.echo(f"wrote {path}")
         return
     board = api.board(tasks, runs=runs, published=published, **asked)
-    if format_ is not Format.json:
+    if format_ != "json":
         _left_out(board.refused)
         if not board.sections:
             raise _nothing(runs, tasks)
-    if format_ is Format.table:
+    if format_ == "table":
         console = table_console(WIDE)
         for sheet in board.sheets(explain):
             console.print(sheet)
@@ -184,10 +173,10 @@ def _nothing(runs: Path, tasks: Sequence[str]) -> UnknownNameError:
 def _text(board: Leaderboard, explain: bool, format_: Format) -> str:
     """Return tables as the text of a file."""
     match format_:
-        case Format.json:
+        case "json":
             return json.dumps(board.as_dict()) + "\n"
-        case Format.csv:
+        case "csv":
             return csv_rows(board.flat())
-        case Format.markdown:
+        case "markdown":
             return "\n".join(sheet.markdown() for sheet in board.sheets(explain)) + "\n"
     return "\n".join(sheet.latex() for sheet in board.sheets(explain))
