@@ -3,10 +3,10 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/verdicts_calibration.py [--pairs 10000] [PART ...]
 
 Fresh runs are drawn from smoothed models (`SmoothedRuns`) of the published entries of task beam6g, on the 49 cells of
-its surface grid. `--pairs` is the number of simulated pairs or studies per line (parts equals, unequal, decisions,
+its surface grid. `--pairs` is the number of simulated pairs or studies per line (parts equals, decisions,
 equality); a tenth of it for power, seeds and studies of five entries, 1/25 for coverage, a hundredth for boards. Many
 tables of docs/error-rates.md are its output. `benchmarks/calibration.py` measures entries of
-your own.
+your own, and `benchmarks/laws.py` rule `steps` on generated runs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 from simulated import judge, simulated_pairs
@@ -22,11 +21,9 @@ from simulated import judge, simulated_pairs
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import (
     Decided,
-    Direction,
     Grid,
     IntervalRule,
     LearningCurves,
-    MaxT,
     SequentialDesign,
     SmoothedRuns,
     TimesRule,
@@ -39,7 +36,8 @@ from qrlsuite.statistics import (
     times_below,
     times_board,
 )
-from qrlsuite.statistics.simulation import draw_times, judge_times, play
+from qrlsuite.statistics.permutation import with_half_epoch
+from qrlsuite.statistics.simulation import draw_steps, draw_times, judge_steps, play
 
 EPSILONS, DELTAS = [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 GRID = Grid.relative(EPSILONS, DELTAS)
@@ -73,83 +71,6 @@ def head(title: str, *columns: str) -> None:
     print("|" + "---|" * len(columns), flush=True)
 
 
-@cache
-def mean_of_many() -> np.ndarray:
-    """Return the mean times of 100,000 runs like those of width 64."""
-    many = draw_times(MODELS[W64], 1000, 100, GRID, np.random.default_rng(0))
-    return many.reshape(-1, len(EPSILONS)).mean(axis=0)
-
-
-def unequal_laws(
-    share: float, n_fail: int, n_other: int, pairs: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw pairs of one mean at every tolerance: some runs of the first never learn, all of the second are later."""
-    later = np.rint(share * (HORIZON - mean_of_many())).astype(np.int64)
-    ours = draw_times(MODELS[W64], n_fail, pairs, GRID, generator)
-    ours[generator.random(ours.shape[:2]) < share] = HORIZON
-    return ours, draw_times(MODELS[W64], n_other, pairs, GRID, generator) + later
-
-
-def found(ours: np.ndarray, theirs: np.ndarray, skewed: bool) -> float:
-    """Return the share of pairs that are told apart at 5 percent."""
-    test = MaxT(list(zip(ours, theirs)), skewed=skewed)
-    test.extend(10_000)
-    return float((test.p <= 0.05).mean())
-
-
-def print_unequal(pairs: int) -> None:
-    """Both rules; a tenth of the pairs for studies. The last column is the chance that no failing run was seen."""
-    columns = ("runs that fail", "runs of each", "times", "times-skewed", "no failing run among them")
-    head(f"Equal means, unequal laws, {pairs} pairs: any difference", *columns)
-    generator = np.random.default_rng(0)
-    for share in (0.05, 0.1, 0.15, 0.3):
-        for n_runs in SIZES:
-            pair = unequal_laws(share, n_runs, n_runs, pairs, generator)
-            line(
-                f"{share:.0%}", n_runs, *(found(*pair, kind) for kind in (False, True)), (1 - share) ** n_runs
-            )
-    columns = ("runs that may fail", "other runs", "times", "times-skewed")
-    head("The same at unequal numbers, 15% fail", *columns)
-    for n_fail, n_other in ((20, 100), (100, 20)):
-        pair = unequal_laws(0.15, n_fail, n_other, pairs, generator)
-        line(n_fail, n_other, *(found(*pair, kind) for kind in (False, True)))
-    count = max(10, pairs // 2)
-    head(
-        f"The same in studies with looks of two entries, {count} studies",
-        "runs that fail",
-        "looks",
-        "times",
-        "times-skewed",
-    )
-    for share in (0.05, 0.15):
-        drawn = unequal_laws(share, 100, 100, count, generator)
-        for looks in ((20, 40, 60, 80, 100), (40, 60, 80, 100)):
-            designs = (SequentialDesign(("a", "b"), looks, rule=rule) for rule in ("times", "times-skewed"))
-            line(
-                f"{share:.0%}",
-                ", ".join(map(str, looks)),
-                *(play(design, drawn).any_difference for design in designs),
-            )
-
-
-def print_skewed(pairs: int) -> None:
-    """What the correction for skewness costs: error between equals, and power."""
-    head(f"Both rules, {pairs} pairs: told apart", "pair", "runs", "times", "times-skewed")
-    generator = np.random.default_rng(11)
-    slow = SmoothedRuns(slower(ENTRIES[W64], 1.1))
-    for name, *models in (
-        ("width 64, equals", MODELS[W64], MODELS[W64]),
-        ("width 16, equals", MODELS[W16], MODELS[W16]),
-        ("10 qubits, equals", MODELS[Q10], MODELS[Q10]),
-        ("width 64, 10% slower", MODELS[W64], slow),
-        ("10 against 8 qubits", MODELS[Q10], MODELS[Q8]),
-        ("width 32 against 10 qubits", MODELS[W32], MODELS[Q10]),
-    ):
-        for n_runs in SIZES:
-            pair = [draw_times(model, n_runs, pairs, GRID, generator) for model in models]
-            line(name, n_runs, *(found(*pair, kind) for kind in (False, True)))
-
-
 def print_replication(pairs: int) -> None:
     """How much of the published board comes out again with 100 fresh runs per entry, by either rule."""
     count, generator = max(10, pairs // 10), np.random.default_rng(12)
@@ -170,7 +91,7 @@ def print_replication(pairs: int) -> None:
     n_pairs = len(entries) * (len(entries) - 1) // 2
     columns = ("of the published board", f"comes out again, of {count} replications")
     head(f"{len(entries)} entries, 100 fresh runs each (published runs mixed with near neighbors)", *columns)
-    line(f"a decision by `times` ({len(decided)} of {n_pairs} pairs)", float(again / count))
+    line(f"a decision by `steps` ({len(decided)} of {n_pairs} pairs)", float(again / count))
     line("all of these decisions at once", all_again / count)
     line("the order by mean", order / count)
     line(f"the {len(tiers)} tiers of the paper's rule", tiering / count)
@@ -218,7 +139,7 @@ def rivals(entries: dict[str, LearningCurves]) -> list[tuple[str, SmoothedRuns, 
 
 
 def print_populations(pairs: int) -> None:
-    """Rule times on width 64 against itself 10 percent slower, its runs drawn in three ways."""
+    """Rule `steps` on width 64 against itself 10 percent slower, its runs drawn in three ways."""
     count, generator = pairs // 10, np.random.default_rng(10)
     entries = ENTRIES[W64], slower(ENTRIES[W64], 1.1)
     sides = [times_below(entry.values, GRID, entry.steps_per_epoch) for entry in entries]
@@ -226,21 +147,21 @@ def print_populations(pairs: int) -> None:
         f"\nM of the published runs: the second's is {sides[1].mean() / sides[0].mean():.4f} times the first's"
     )
     columns = ("runs drawn", "second's M / first's", *(f"{n_runs} runs" for n_runs in SIZES))
-    head(f"Rule times, width 64 against itself 10% slower, {count} pairs: first needs fewer", *columns)
+    head(f"Rule `steps`, width 64 against itself 10% slower, {count} pairs: first needs fewer", *columns)
     for name, draw in (("from the published ones", _resampled), ("mixed with a neighbor", _mixed)):
         large = [_times(draw(entry, 5000, generator)).mean() for entry in entries]
         power = []
         for n_runs in SIZES:
-            drawn = [_times(draw(entry, count * n_runs, generator)) for entry in entries]
+            drawn = [_steps(draw(entry, count * n_runs, generator)) for entry in entries]
             ours, theirs = (each.reshape(count, n_runs, -1) for each in drawn)
-            power.append(judge_times(ours, theirs).first)
+            power.append(judge_steps(ours, theirs).first)
         line(name, f"{large[1] / large[0]:.3f}", *power)
     models = [SmoothedRuns(entry) for entry in entries]
     large = [draw_times(model, 5000, 1, GRID, generator).mean() for model in models]
     power = []
     for n_runs in SIZES:
-        ours, theirs = (draw_times(model, n_runs, count, GRID, generator) for model in models)
-        power.append(judge_times(ours, theirs).first)
+        ours, theirs = (draw_steps(model, n_runs, count, GRID, generator) for model in models)
+        power.append(judge_steps(ours, theirs).first)
     line("smoothed (SmoothedRuns)", f"{large[1] / large[0]:.3f}", *power)
 
 
@@ -259,6 +180,10 @@ def _mixed(entry: LearningCurves, count: int, generator: np.random.Generator, ne
     second = neighbors[first, generator.integers(0, nearest, count)]
     share = generator.random((count, 1))
     return share * values[first] + (1 - share) * values[second]
+
+
+def _steps(values: np.ndarray) -> np.ndarray:
+    return with_half_epoch(_times(values), 2000).sum(axis=1, keepdims=True)
 
 
 def _times(values: np.ndarray) -> np.ndarray:
@@ -321,7 +246,7 @@ def print_boards(pairs: int) -> None:
         total += len(decided)
         tiering += _tiers(fresh) == tiers
     print(
-        f"Published board: {len(decided)} of 28 pairs decided by times; of {count} replications with 100 fresh"
+        f"Published board: {len(decided)} of 28 pairs decided by steps; of {count} replications with 100 fresh"
     )
     print(
         f"runs each, {again / total:.1%} of these decisions came out again, all of them in {same / count:.1%};"
@@ -333,9 +258,7 @@ def print_boards(pairs: int) -> None:
         places = f"{now.ranks[i, 0]} to {now.ranks[i, 1]}"
         tier = next(k for k, names in enumerate(tiers, 1) if now.names[i] in names)
         line(now.names[i], tier, f"{mean.mean:.0f}", f"{low} to {high}", float(mean.at_cap.mean()), places)
-    kinds = [now.directions[i][j] for i in size for j in size if i < j]
-    print(f"trade-offs: {kinds.count(Direction.TRADE_OFF)}; order at half the horizon: "
-          f"{[now.names[i] for i in now.order_at_half]}")  # fmt: skip
+    print(f"order at half the horizon: {[now.names[i] for i in now.order_at_half]}", flush=True)
 
 
 def _named(entry: LearningCurves, index: int) -> LearningCurves:
@@ -372,8 +295,6 @@ def print_coverage(pairs: int) -> None:
 
 
 PARTS: dict[str, Callable[[int], None]] = {
-    "unequal": print_unequal,
-    "skewed": print_skewed,
     "replication": print_replication,
     "equality": print_equality,
     "power": print_power,

@@ -82,7 +82,7 @@ def places(signs: NDArray[np.int64], kind: str, levels: Iterable[str]) -> str:
 
 
 def judged(board: TimeRanking, first: str, second: str, expected: str, cells: Comparison) -> str:
-    """Return the verdict on a statement about a pair, by rule `times` with Holm's correction."""
+    """Return the verdict on a statement about a pair, by rule `steps` with Holm's correction."""
     labels = [row.entry.label for row in board.rows]
 
     def direction(other: str) -> Direction:
@@ -91,9 +91,7 @@ def judged(board: TimeRanking, first: str, second: str, expected: str, cells: Co
     decided, wins, losses = direction(second), cells.count(Verdict.WIN), cells.count(Verdict.LOSS)
     if decided is Direction.NOT_TOLD_APART:
         word = "a trade-off" if wins and losses else "fewer" if wins else "more" if losses else None
-        return f"not told apart by `times`; {word} by the paper's rule" if word else "not told apart"
-    if decided is Direction.TRADE_OFF:
-        return "a trade-off"
+        return f"not told apart by `steps`; {word} by the paper's rule" if word else "not told apart"
     if expected.startswith("as many"):
         share = (wins + losses) / sum(len(line) for line in cells.verdicts)
         return FEW_CELLS if share < (0.5 if expected == "as many" else 0.1) else "does not hold"
@@ -106,7 +104,7 @@ def judged(board: TimeRanking, first: str, second: str, expected: str, cells: Co
     if {"fewer": Direction.FEWER, "no fewer": Direction.MORE}.get(expected) is not decided:
         return "does not hold"
     if losses if expected == "fewer" else wins:
-        return "holds by `times`, not by the paper's rule"
+        return "holds by `steps`, not by the paper's rule"
     if second + RETUNED in labels and direction(second + RETUNED) is not decided:
         return "holds at the released rates only"
     return "holds"
@@ -120,8 +118,6 @@ def pair(row: Row, match: re.Match[str]) -> Row:
     entries = {each.entry.label: each.entry for each in board.rows}
     i, j = (board.order[list(entries).index(label)] for label in (first, second))
     change = f"steps below threshold {percent(board.board.difference[i, j])}"
-    if board.board.directions[i][j] is not Direction.NOT_TOLD_APART:
-        change += places(board.board.signs[i, j], board.kind, board.levels)
     error = f".05 for {board.n_pairs} pair" + "s" * (board.n_pairs > 1)
     return {
         "verdict": judged(board, first, second, row["expected"], cells),
@@ -138,11 +134,11 @@ Compared = list[tuple[str, TimesBoard, Direction, str]]
 
 
 def each_model(found: Iterable[tuple[EntryResults, EntryResults]], first: str, second: str) -> Compared:
-    """Compare the entries of each pair by `times`, with Holm's correction over the pairs.
+    """Compare the entries of each pair by `steps`, with Holm's correction over the pairs.
 
     Returns
     -------
-    Label, board, direction and `+14%, more at epsilon 0.1, p 0.0004` of each pair, the largest model first.
+    Label, board, direction and `+14%, p 0.0004` of each pair, the largest model first.
     """
     found = sorted(found, key=lambda pair: sum(pair[1].parameters), reverse=True)
     pairs = []
@@ -154,19 +150,11 @@ def each_model(found: Iterable[tuple[EntryResults, EntryResults]], first: str, s
             for name, each in ((first, entry), (second, other))
         ]
         grid = ranking_of([other]).grid
-        pairs.append(
-            (other.label, *(times_board(curves, grid, alpha) for alpha in (0.05, 0.05 / len(found))))
-        )
-    levels = [f"{float(level):g}" for level in grid.levels]
+        pairs.append((other.label, times_board(curves, grid)))
     compared: Compared = []
-    for p, (label, board, strict) in zip(holm([board.p[0, 1] for _, board, _ in pairs]), pairs):
-        direction, where = Direction.NOT_TOLD_APART, ""
-        if p <= 0.05:
-            where = places(strict.signs[0, 1], grid.level_name, levels)
-            direction = strict.directions[0][1]
-            if direction is Direction.NOT_TOLD_APART:
-                direction = board.directions[0][1]
-        compared.append((label, board, direction, f"{percent(board.difference[0, 1])}{where}, p {p:.4f}"))
+    for p, (label, board) in zip(holm([board.p[0, 1] for _, board in pairs]), pairs):
+        direction = board.directions[0][1] if p <= 0.05 else Direction.NOT_TOLD_APART
+        compared.append((label, board, direction, f"{percent(board.difference[0, 1])}, p {p:.4f}"))
     return compared
 
 
@@ -186,15 +174,11 @@ def every_model(row: Row, match: re.Match[str]) -> Row:
     first, second = match["first"], match["second"]
     compared = each_model(twice(**match.groupdict()), first, second)
     directions = [direction for _, _, direction, _ in compared]
-    against = sum(each in (Direction.FEWER, Direction.TRADE_OFF) for each in directions)
+    against = directions.count(Direction.FEWER)
     if set(directions) == {Direction.MORE}:
         text = "holds"
     elif row["expected"] == "more":
         text = f"holds for {directions.count(Direction.MORE)} of {len(directions)} models"
-        shown = [each for _, _, direction, each in compared if direction is Direction.MORE]
-        where = {each.partition("more at ")[2].partition(", p ")[0] for each in shown}
-        if len(where) == 1 < len(shown) and re.fullmatch("epsilon [^,]+", *where):
-            text += f", at {where.pop()} alone"
     else:
         text = f"does not hold for {against} of {len(directions)} models" if against else "not told apart"
     seeds = [str(board.n_runs[0]) for _, board, _, _ in compared]

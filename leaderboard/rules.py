@@ -22,7 +22,7 @@ DEFAULT = "intervals"
 """The paper's rule."""
 PAPER = "paper"
 """Another name for it."""
-TIMES = "times"
+STEPS = "steps"
 """The rule by which boards rank, with Holm's correction over all pairs of a board."""
 
 _HERE = "qrlsuite.statistics.significance"
@@ -41,16 +41,16 @@ def register_rules(register: Callable[[RuleSpec], None]) -> None:
     )
     register(
         RuleSpec(
-            name=TIMES,
-            summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
-            factory=f"{_PERMUTATION}:TimesRule",
+            name=STEPS,
+            summary="labels of runs permuted, ratio of mean steps below all tolerances: the rule of boards and compare",
+            factory=f"{_PERMUTATION}:StepsRule",
         )
     )
     register(
         RuleSpec(
-            name="times-skewed",
-            summary="the same with a t corrected for skewness: errs less where some runs of one entry fail",
-            factory=f"{_PERMUTATION}:SkewedTimesRule",
+            name="times",
+            summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
+            factory=f"{_PERMUTATION}:TimesRule",
         )
     )
 

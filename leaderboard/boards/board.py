@@ -115,7 +115,7 @@ def build(
         Lines about unreadable entries; they are passed on.
     rule:
         The rule of tiers, see `qrlsuite.leaderboard.rules.load`. None means each task's own rule, or the paper's if the
-        task names none. Tables show tiers if a rule other than `times` is given or named.
+        task names none. Tables show tiers if a rule other than `steps` is given or named.
     horizon:
         Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
     alpha:

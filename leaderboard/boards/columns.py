@@ -223,7 +223,8 @@ def ranks(section: Section) -> list[Column[Row]]:
             lambda row: (
                 0.0 if row.entry is first else None if row.time.difference is None else row.time.difference[0]
             ),
-            meaning=f"steps {before} threshold, against the first entry of the table",
+            meaning=f"steps {before} threshold, against the first entry of the table; each interval at the level of "
+            "the pair's own test, not all together",
             head="vs. first",
             cell=lambda row: row.time.difference_text.partition(" ")[0],
             beside=lambda row: row.time.difference_text.partition(" ")[2],

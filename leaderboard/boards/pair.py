@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,14 @@ from qrlsuite.statistics import (
     times_pair,
 )
 from qrlsuite.statistics.grid import FloatArray
+from qrlsuite.statistics.steps import most_failures, runs_that_decide
 
-_DECIDED = (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
+_DECIDED = (Direction.FEWER, Direction.MORE)
+_SECONDS = 10.0  # of relabeling
+_UNSEEN = 50  # seeds below which failures that did not occur may turn a verdict
+_SPREADS = ((3, 20), (10, 50))
+"""How many times one entry's seeds vary as much as the other's, and up to how many seeds that misleads (see
+docs/error-rates.md)."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,6 @@ class PairVerdict:
     @property
     def said(self) -> str:
         """The same without its beginning, for a list that has said it."""
-        first, second = self.labels
         pair = self.times
         if (pair.at_cap == 1).all():
             return (
@@ -120,38 +125,62 @@ class PairVerdict:
             )
         match pair.direction:
             case Direction.UNDECIDED:
-                few = f"fewer than {MIN_RUNS} seeds" if min(pair.n_runs) < MIN_RUNS else "seeds are missing"
-                return f"undecided: {few} ({self._seeds}); so far {self._not_told_apart}"
+                could = f"{runs_that_decide(pair.alpha)} each could"
+                return f"cannot be decided with so few seeds ({could}): so far {self._not_told_apart} ({self._seeds})"
             case Direction.NOT_TOLD_APART:
-                return f"not told apart: {self._not_told_apart} ({self._seeds}, {self._p})"
-            case Direction.TRADE_OFF:
-                return (
-                    f"trade-off: {first} needs fewer steps at {self._at(1)}, {second} at {self._at(-1)} "
-                    f"({self._seeds}, {self._p})"
-                )
-        return self._decided(pair.direction is Direction.FEWER)
+                return f"not told apart: {self._not_told_apart} ({self._seeds}, {self._p}){self._detectable}"
+        return self._decided
 
-    def _decided(self, first_wins: bool) -> str:
-        """Name the entry that needs fewer steps and, if the mean does not show it, the thresholds that do."""
-        winner, loser = self.labels if first_wins else self.labels[::-1]
-        mean = fewer(self.times.difference, first_wins)
-        if mean[1] > 0:
-            return (
-                f"{winner} needs {share_text(mean[0])} fewer steps than {loser} ({share_text(mean[1])} to "
-                f"{share_text(mean[2])}, {self._seeds}, {self._p})"
-            )
-        if math.isnan(mean[1]):
-            return f"{winner} needs fewer steps than {loser} ({self._seeds}, {self._p})"
-        return (
-            f"{winner} needs fewer steps than {loser} at {self._at(1 if first_wins else -1)} ({self._seeds}, "
-            f"{self._p}); over all {counted(len(self.thresholds), 'threshold')} "
-            f"{_fewer_or_more(mean[0])} ({_fewer_or_more(mean[2])} to {_fewer_or_more(mean[1])})"
+    @property
+    def _decided(self) -> str:
+        """Say how many steps more or fewer the first entry needs, and what so few seeds cannot know."""
+        first, second = self.labels
+        value, low, high = fewer(self.times.difference)
+        least, most = sorted((abs(low), abs(high)))
+        ends = (
+            f"{share_text(least)} or more"
+            if math.isinf(most)
+            else f"{share_text(least)} to {share_text(most)}"
         )
+        return (
+            f"{first} needs {_fewer_or_more(value)} steps than {second} ({ends}, {self._seeds}, {self._p})"
+            f"{self._crossing}{self._caution}"
+        )
+
+    @property
+    def _crossing(self) -> str:
+        """Name the thresholds at which the other entry needs significantly fewer steps."""
+        signs, mean = self.times.signs, 1 if self.times.direction is Direction.FEWER else -1
+        against = [threshold for threshold, sign in zip(self.thresholds, signs) if sign == -mean]
+        other = self.labels[1] if mean > 0 else self.labels[0]
+        return f", but {other} needs fewer at {', '.join(against)}" if against else ""
+
+    @property
+    def _caution(self) -> str:
+        """Say where the rule is measured to err in more than 7.5 percent."""
+        pair, clauses = self.times, list[str]()
+        unseen = [n for n, failed in zip(pair.n_runs, pair.failed) if not failed and n < _UNSEEN]
+        if unseen:
+            clauses.append(
+                f"none of {min(unseen)} seeds failed, but up to {share_text(most_failures(min(unseen)))} may"
+            )
+        less, more = sorted(pair.spreads)
+        if more and any(more >= factor * less and min(pair.n_runs) <= most for factor, most in _SPREADS):
+            times = f" {more / less:.0f} times as much as the other's" if less else " and the other's do not"
+            clauses.append(f"one entry's seeds vary{times}, which so few seeds can mistake for a difference")
+        return "".join(f"; {clause}" for clause in clauses)
+
+    @property
+    def _detectable(self) -> str:
+        share = self.times.detectable
+        if math.isnan(share) or not share or self.adjusted:
+            return ""
+        return f"; so many seeds show {share_text(share)} fewer in 4 of 5 cases"
 
     @property
     def _not_told_apart(self) -> str:
         first, second = self.labels
-        value, low, high = fewer(self.times.difference, True)
+        value, low, high = fewer(self.times.difference)
         if math.isnan(value):
             return f"{first} and {second}"
         text = f"{first} needs {_fewer_or_more(value)} steps than {second}"
@@ -164,25 +193,8 @@ class PairVerdict:
 
     @property
     def _p(self) -> str:
-        return "adjusted " * self.adjusted + said(self.times.p)
-
-    def _at(self, sign: int) -> str:
-        """Name the thresholds at which the first (1) or the second (-1) needs significantly fewer steps, and its share.
-
-        If no threshold is significant at the level of a sign, the verdict rests on the threshold with the smallest p.
-        """
-        chosen = np.flatnonzero(self.times.signs == sign)
-        places = chosen if len(chosen) else [int(self.times.p_each.argmin())]
-        texts = []
-        for place in places:
-            value, low, high = fewer(self.times.differences[place], sign > 0)
-            size = (
-                ""
-                if math.isnan(low)
-                else f" ({share_text(value)} fewer, {share_text(low)} to {share_text(high)})"
-            )
-            texts.append(f"{self.thresholds[place]}{size}")
-        return f"{'threshold' if len(texts) == 1 else 'thresholds'} {', '.join(texts)}"
+        error = f" +- {self.times.p_error:.1g}" if self.times.p_error else ""
+        return "adjusted " * self.adjusted + said(self.times.p) + error
 
     def columns(self) -> tuple[str, ...]:
         """Return the heads of the table that `rows` fills."""
@@ -216,7 +228,7 @@ class PairVerdict:
         return [
             f"steps {self.before} threshold: mean over seeds; a seed that never reaches it counts with "
             f"{steps_text(self.times.horizon)}",
-            "p: adjusted for all thresholds; intervals: of each threshold by itself",
+            "difference: of the first entry against the second; p and intervals: for all thresholds together",
         ]
 
     @property
@@ -242,6 +254,7 @@ class PairVerdict:
             "n_runs": list(pair.n_runs),
             "verdict": str(pair.direction),
             "p": _number(pair.p),
+            "p_error": pair.p_error,
             "difference": _number(pair.difference[0]),
             "difference_interval": [_number(end) for end in pair.difference[1:]],
             "by_threshold": [
@@ -276,7 +289,7 @@ def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: flo
     several = min(side.n_runs for side in cut) > 1
     return PairVerdict(
         labels=_short(first, second),
-        times=times_pair(one, other, grid, alpha),
+        times=times_pair(one, other, grid, alpha, seconds=_SECONDS),
         thresholds=tuple(f"{threshold:g}" for threshold in grid.thresholds),
         scores=compare_scores({str(k): final_scores(side) for k, side in enumerate(cut)}, alpha)
         if several
@@ -333,7 +346,7 @@ def on_board(
 def pair_on(
     ranking: TimeRanking, first: TimeRow, second: TimeRow, grid: Grid, labels: tuple[str, str]
 ) -> PairVerdict:
-    """Return the board's verdict on two of its rows; nothing is tested anew.
+    """Return the board's verdict on two of its rows; of entries that it does not rank the pair's own.
 
     Parameters
     ----------
@@ -345,48 +358,49 @@ def pair_on(
     board = ranking.board
     rows = first, second
     i, j = (ranking.order[ranking.rows.index(row)] for row in rows)
-    verdict = board.directions[i][j]
+    each = np.full(len(grid.levels), np.nan)
+    thresholds = tuple(f"{threshold:g}" for threshold in grid.thresholds)
+    whole = min(ranking_of([row.entry for row in rows]).horizons)
+    if board.directions[i][j] is Direction.UNDECIDED:
+        one, other = (LearningCurves(r.entry.curves, r.entry.steps_per_epoch, r.entry.name) for r in rows)
+        alone = times_pair(one, other, grid, board.alpha, board.horizon, seconds=_SECONDS)
+        missing = any(row.entry.missing for row in rows)
+        return PairVerdict(
+            labels, alone, thresholds, None, 0, whole=whole, before=grid.before, provisional=bool(missing)
+        )
     times = TimesPair(
         n_runs=(board.n_runs[i], board.n_runs[j]),
         horizon=board.horizon,
         alpha=board.alpha,
-        direction=verdict,
+        direction=board.directions[i][j],
         p=float(board.adjusted[i, j]),
+        p_error=0.0,
         difference=np.array([board.difference[i, j], *board.difference_interval[i, j]]),
-        signs=board.signs[i, j],
-        p_each=np.full(len(grid.levels), np.nan),
-        means=np.full((2, len(grid.levels)), np.nan),
-        differences=np.full((len(grid.levels), 3), np.nan),
+        detectable=math.nan,
+        failed=(board.failed[i], board.failed[j]),
+        spreads=(board.spreads[i], board.spreads[j]),
+        signs=np.zeros(len(each), dtype=np.int64),
+        p_each=each,
+        means=np.stack([each, each]),
+        differences=np.stack([each, each, each], axis=1),
         at_cap=np.stack([row.mean.at_cap for row in rows]),
     )
-    by_mean = verdict in _DECIDED[:2] and fewer(times.difference, verdict is Direction.FEWER)[1] > 0
-    if verdict in _DECIDED and not by_mean:  # the sentence names thresholds
-        one, other = (LearningCurves(r.entry.curves, r.entry.steps_per_epoch, r.entry.name) for r in rows)
-        alone = times_pair(one, other, grid, board.alpha, board.horizon)
-        times = replace(times, p_each=alone.p_each, differences=alone.differences)
-    thresholds = tuple(f"{threshold:g}" for threshold in grid.thresholds)
-    whole = min(ranking_of([row.entry for row in rows]).horizons)
     return PairVerdict(labels, times, thresholds, None, 0, adjusted=True, whole=whole, before=grid.before)
 
 
-def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:
-    """Return the share of steps that the first saves against the second (or the reverse): mean, low, high.
+def fewer(difference: FloatArray) -> tuple[float, float, float]:
+    """Return the share of steps that the first entry saves against the second, negative where it needs more.
 
     Parameters
     ----------
     difference:
         Shape (3,): the first entry's mean over the second's, minus 1, and the ends of its interval.
 
-    >>> fewer(np.array([-0.5, -0.6, -0.25]), True)
+    >>> fewer(np.array([-0.5, -0.6, -0.25]))
     (0.5, 0.25, 0.6)
-    >>> fewer(np.array([1.0, 0.6, 3.0]), False)
-    (0.5, 0.375, 0.75)
     """
     value, low, high = difference.tolist()
-    if first:
-        return -value, -high, -low
-    value, low, high = (1 - 1 / (1 + each) for each in (value, low, high))
-    return value, low, high
+    return -value, -high, -low
 
 
 def _fewer_or_more(value: float) -> str:

@@ -28,7 +28,7 @@ from qrlsuite.leaderboard.boards.ranked import (
     unranked_since,
 )
 from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow, rank_by_time
-from qrlsuite.leaderboard.rules import TIMES
+from qrlsuite.leaderboard.rules import STEPS
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Board, SignificanceRule, last_epochs, outperformance
 
@@ -273,7 +273,7 @@ def sections(
         try:
             chosen = rule or rule_of(group)
             named = rule is not None or ranking_of(group).rule is not None
-            by_tiers = named and chosen.name != TIMES
+            by_tiers = named and chosen.name != STEPS
             section = _section(task, steps, provisional, group, chosen, by_tiers, alpha, shown)
             if by_tiers:
                 _ = section.tiers  # a rule that fails is reported here

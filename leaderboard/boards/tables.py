@@ -339,7 +339,7 @@ def _tuning_text(tuning: Mapping[str, Any], preset: str | None) -> str:
     return f"preset '{preset}', {tuning['note']}: {text}" if preset and tuning.get("note") else text
 
 
-SIGNS = {Direction.FEWER: "+", Direction.MORE: "-", Direction.TRADE_OFF: "+/-"}
+SIGNS = {Direction.FEWER: "+", Direction.MORE: "-"}
 """A decided pair, from the row's side."""
 
 
@@ -354,8 +354,8 @@ def pairs_sheet(section: Section) -> Sheet:
         rows, order = [row.entry for row in section.rows], list(section.times.order)
         texts = [[_decision_text(section, i, j) for j in order] for i in order]
         notes = [
-            "+ the row's entry outperforms the column's; - the reverse; +/- a trade-off; a number: adjusted p of a "
-            "pair that is not told apart"
+            "+ the row's entry outperforms the column's; - the reverse; a number: adjusted p of a pair that is not "
+            "told apart"
         ]
     if any("?" in line for line in texts):
         notes.append(f"? {TOO_FEW}")

@@ -102,7 +102,7 @@ class TimeRanking:
 
     @property
     def n_decided(self) -> int:
-        """Number of decided pairs, with trade-offs, whether or not the entries are shown."""
+        """Number of decided pairs, whether or not the entries are shown."""
         return sum(decided(each) for row in self.board.directions for each in row) // 2
 
     @property
@@ -110,27 +110,14 @@ class TimeRanking:
         """Entries of 20 seeds or more, none missing: the family over whose pairs Holm's procedure goes."""
         return int(self.board.ranks.all(axis=1).sum())
 
-    def trade_offs(self) -> list[str]:
-        """Return a line for every pair in which each entry needs fewer steps at some threshold."""
-        return [
-            f"trade-off: {self._label(i)} needs fewer steps at {self._thresholds(i, j)}; "
-            f"{self._label(j)} at {self._thresholds(j, i)}"
-            for i, j in self._pairs()
-            if self.board.directions[i][j] is Direction.TRADE_OFF
-        ]
-
-    def against_the_order(self) -> list[str]:
-        """Name every decided pair whose better entry has the larger M."""
-        return [
-            f"against the order: {self._label(j)} outperforms {self._label(i)}, though it needs more steps on average: "
-            f"it needs significantly fewer at {self._thresholds(j, i) or 'a threshold'}"
-            for i, j in self._pairs()
-            if self.board.directions[i][j] is Direction.MORE
-        ]
-
     def special(self) -> list[str]:
-        """Return a line for every pair that needs a word."""
-        return self.trade_offs() + self.against_the_order()
+        """Name every pair whose decision more relabelings could turn."""
+        return [
+            f"within Monte Carlo error of its level after 10 million relabelings: {self._label(i)} and {self._label(j)}"
+            for place, i in enumerate(self.order)
+            for j in self.order[place + 1 :]
+            if self.board.turns[i, j]
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON. Matrices are in the order of `rows`, from the row's side."""
@@ -150,8 +137,7 @@ class TimeRanking:
                 [[_number(end) for end in self.board.difference_interval[i, j]] for j in order] for i in order
             ],
             "unequal_and_few": [[bool(self.board.few[i, j]) for j in order] for i in order],
-            "trade_offs": self.trade_offs(),
-            "against_the_order": self.against_the_order(),
+            "within_monte_carlo_error": self.special(),
         }
 
     def told_apart_from_next(self, row: TimeRow) -> bool | None:
@@ -163,7 +149,7 @@ class TimeRanking:
         return decided(self.board.directions[self.order[index]][self.order[index + 1]])
 
     def against(self, row: TimeRow) -> dict[str, object]:
-        """Return a row's pairs for a spreadsheet: every adjusted p as `entry: p`, and the trade-offs."""
+        """Return a row's pairs for a spreadsheet: every adjusted p as `entry: p`."""
         i, names = self.order[self.rows.index(row)], self.board.names
         return {
             "adjusted_p": [
@@ -171,19 +157,7 @@ class TimeRanking:
                 for j in self.order
                 if not math.isnan(self.board.adjusted[i, j])
             ],
-            "trade_offs": [
-                names[j] for j in self.order if self.board.directions[i][j] is Direction.TRADE_OFF
-            ],
         }
-
-    def _pairs(self) -> list[tuple[int, int]]:
-        """All pairs of the shown entries, the entry with the smaller M first."""
-        return [(i, j) for place, i in enumerate(self.order) for j in self.order[place + 1 :]]
-
-    def _thresholds(self, i: int, j: int) -> str:
-        """Name the thresholds at which an entry needs significantly fewer steps than another."""
-        levels = [level for level, sign in zip(self.levels, self.board.signs[i, j]) if sign > 0]
-        return f"{self.kind} {', '.join(levels)}" if levels else ""
 
     def _label(self, index: int) -> str:
         return self.rows[self.order.index(index)].entry.label
@@ -252,8 +226,8 @@ def rank_by_time(
 
 
 def decided(direction: Direction) -> bool:
-    """Return whether a pair is decided; a trade-off counts."""
-    return direction in (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
+    """Return whether a pair is decided."""
+    return direction in (Direction.FEWER, Direction.MORE)
 
 
 def _number(value: float) -> float | None:

@@ -72,7 +72,7 @@ def draw(outcome: State) -> Figure:
         f"{study.task}: {study.name}",
         f"repeated confidence intervals: they hold at every look, {confidence:g} percent for all "
         f"{len(decision.pairs)} pairs together",
-        "a verdict is decided at any threshold, the interval is that of their mean",
+        _open_markers(decision.pairs),
         f"shaded: equal within {100 * margin:g} percent",
         "right: seeds of each entry at the pair's last look",
         "an early stop overstates the difference",
@@ -166,8 +166,8 @@ def draw_together(together: StudiesTogether) -> Figure:
         f"{len(studies)} tasks: {studies[0].study.name} and {len(studies) - 1} more",
         "tasks: each study's verdicts and repeated confidence intervals, which hold for all of its pairs and looks; "
         "right: seeds of each entry at the pair's last look",
-        "a verdict is decided at any threshold, the interval is that of their mean; equality is tested for each pair "
-        "by itself; an early stop overstates the difference",
+        "equality is tested for each pair by itself; an early stop overstates the difference",
+        _open_markers(shown),
         "mean: of the ratios, by the first look's seeds of each study, with a 95 percent interval by itself; the "
         "verdict holds for all pairs",
         "" if shade is None else f"shaded: equal within {100 * shade:g} percent",
@@ -180,8 +180,12 @@ def draw_together(together: StudiesTogether) -> Figure:
 def _reversed(pair: PairDecision) -> PairDecision:
     """Return a pair with its entries exchanged, in all that a row shows."""
     decided = {Decided.FIRST: Decided.SECOND, Decided.SECOND: Decided.FIRST}
-    difference, high, low = (
-        math.inf if end == -1 else 1 / (1 + end) - 1 for end in (pair.difference, *pair.interval)
+    (difference, high, low), (leading, leading_high, leading_low) = (
+        [math.inf if end == -1 else 1 / (1 + end) - 1 for end in ends]
+        for ends in (
+            (pair.difference, *pair.interval),
+            (pair.leading_difference, *pair.leading_interval),
+        )
     )
     return dataclasses.replace(
         pair,
@@ -189,6 +193,8 @@ def _reversed(pair: PairDecision) -> PairDecision:
         second=pair.first,
         difference=difference,
         interval=(low, high),
+        leading_difference=leading,
+        leading_interval=(leading_low, leading_high),
         decided=pair.decided and decided.get(pair.decided, pair.decided),
     )
 
@@ -245,7 +251,11 @@ def _finish(figure: Figure, title: str, *footnotes: str) -> None:
 
 
 def _cut(pair: PairDecision) -> bool:
-    return bool(pair.p) and not all(WIDEST[0] <= 1 + end <= WIDEST[1] for end in pair.interval)
+    return bool(pair.p) and not all(WIDEST[0] <= 1 + end <= WIDEST[1] for end in pair.shown[1:])
+
+
+def _open_markers(pairs: Sequence[PairDecision]) -> str:
+    return "open markers: at the threshold that decided" if any(pair.at_threshold for pair in pairs) else ""
 
 
 def _within(ratio: float) -> float:
@@ -259,9 +269,10 @@ def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
         text = "both mean times are 0" if pair.p else "no look yet"
         axes.annotate(text, (1, height), fontsize=8, va="center")
         return []
-    ratio, low, high = (_within(1 + end) for end in (pair.difference, *pair.interval))
+    ratio, low, high = (_within(1 + end) for end in pair.shown)
     _, color, marker = LOOKS[pair.decided]
     axes.plot([low, high], [height, height], color=color, lw=1.6)
-    axes.plot([ratio], [height], marker, color=color, ms=5.5)
+    inside = "white" if pair.at_threshold else color
+    axes.plot([ratio], [height], marker, color=color, ms=5.5, markerfacecolor=inside)
     _at_right(axes, height, f"{pair.n_runs}")
     return [low, high]

@@ -11,6 +11,7 @@ from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import p_text
 from qrlsuite.studies.state import (
+    TURNED,
     State,
     difference_text,
     horizon_note,
@@ -39,7 +40,7 @@ def view(state: State) -> dict[str, Any]:
         names = {"question": clean(each["question"] or "", 300), "pair": clean(versus(pair))}
         row = {"verdict": clean(state.verdict(pair)), "seeds": pair.n_runs, "needs": needs}
         pairs.append({**names, **row, "difference": difference, "interval": interval})
-    notes = reason_note(study), lost_note(state), horizon_note(state)
+    notes = reason_note(study), lost_note(state), horizon_note(state), TURNED.get(study.hash)
     return {
         "name": clean(study.name),
         "question": clean(study.file.summary, 300),

@@ -6,7 +6,7 @@ from qrlsuite.leaderboard.boards.times import TimeRanking
 from qrlsuite.results.text import p_text
 from qrlsuite.statistics import Direction
 
-STYLES = {Direction.FEWER: "win", Direction.MORE: "loss", Direction.TRADE_OFF: "both"}
+STYLES = {Direction.FEWER: "win", Direction.MORE: "loss"}
 
 
 def matrix(ranking: TimeRanking) -> tuple[tuple[tuple[str, str], ...], ...]:

@@ -47,6 +47,7 @@ from qrlsuite.results.store import (
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.statistics.grid import Goal
+from qrlsuite.statistics.steps import LEAST_RUNS
 
 GRID_POINTS = 100
 """Points of a grid that is chosen here, at most, up to the end of the longest run."""
@@ -538,7 +539,8 @@ def _notes(
     if early is not None and held:
         notes.append(f"'{entry}': seeds {format_seeds(held)} end early: {EARLY[early]}")
     if len(seeds) < MIN_RUNS:
-        notes.append(f"'{entry}' has {counted(len(seeds), 'seed')}: a verdict needs {MIN_RUNS} of each entry")
+        needed = f"a verdict needs {LEAST_RUNS} of each entry, a rank on a board {MIN_RUNS}"
+        notes.append(f"'{entry}' has {counted(len(seeds), 'seed')}: {needed}")
     return notes
 
 

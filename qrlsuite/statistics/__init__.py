@@ -6,6 +6,7 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `estimator`: S_hat and its two marks. `bootstrap`: its percentile intervals.
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
+- `steps`: relabelings until no decision can turn, intervals that belong to p, and the limits of few runs.
 - `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times; `pair`: one of them.
 - `sequential`: as many runs as it takes to decide, at one error for all looks.
 - `simulation`: how often all this errs. `planning`: how many runs it takes.
@@ -37,7 +38,7 @@ from qrlsuite.statistics.estimator import (
 from qrlsuite.statistics.final import ScoreBoard, areas, compare_scores, final_scores, last_epochs
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.pair import TimesPair, times_pair
-from qrlsuite.statistics.permutation import MaxT, SkewedTimesRule, TimesRule
+from qrlsuite.statistics.permutation import MaxT, StepsRule, TimesRule
 from qrlsuite.statistics.planning import Need, runs_needed, runs_to_detect
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
 from qrlsuite.statistics.sequential import (
@@ -58,7 +59,6 @@ from qrlsuite.statistics.significance import (
 from qrlsuite.statistics.simulation import (
     DecisionRates,
     SmoothedRuns,
-    TimesRates,
     decision_rates,
     slower,
 )
@@ -90,12 +90,11 @@ __all__ = [
     "ScoreBoard",
     "SequentialDesign",
     "SignificanceRule",
-    "SkewedTimesRule",
     "SmoothedRuns",
     "Spending",
+    "StepsRule",
     "TimesBoard",
     "TimesPair",
-    "TimesRates",
     "TimesRule",
     "Verdict",
     "across_tasks",

@@ -1,20 +1,24 @@
 """One pair by its times below threshold: the verdict of the pair, and every threshold with an interval of its own.
 
-The verdict equals the verdict of a board of these two (`times_board`): the max-T permutation test at level alpha.
+The verdict is that of a board of these two (`times_board`): rule `steps` at level alpha, from 4 runs on.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray
-from qrlsuite.statistics.permutation import MaxT
+from qrlsuite.statistics.permutation import CHUNK, MaxT, with_half_epoch
+from qrlsuite.statistics.steps import LEAST_RUNS, least_p, ratio_interval, settle
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
-from qrlsuite.statistics.times_board import Direction, direction, log_ratios, named_direction, refine
+from qrlsuite.statistics.times_board import Direction, log_ratios, named_direction, spread
+
+POWER = 0.8
+"""With which a pair's runs would have shown `TimesPair.detectable`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,12 +32,18 @@ class TimesPair:
     horizon, alpha:
         Environment steps to which both were cut, and the error probability of the verdict.
     direction:
-        The verdict; undecided where an entry has fewer than 20 runs.
-    p:
-        p of the pair, NaN if undecided.
+        The verdict; undecided where an entry has fewer than 4 runs, or no labeling of so few could decide.
+    p, p_error:
+        p of the pair, NaN if undecided; its Monte Carlo error where more relabelings could turn the verdict, else 0.
     difference:
-        Shape (3,): mean time of the first over mean time of the second, minus 1, and its interval at level 1 - alpha.
-        NaN if the second's is 0; the interval is NaN if an entry has a single run.
+        Shape (3,): mean time of the first over mean time of the second, minus 1, and its interval at level 1 - alpha,
+        half an epoch's steps added to both. The interval is NaN if undecided.
+    detectable:
+        The share of steps that one entry would have to save for these runs to show it with a power of .8.
+    failed:
+        Runs of each that never reach a threshold.
+    spreads:
+        Standard deviation over mean of each entry's runs.
     signs:
         Shape (E,): +1 where the first needs significantly fewer steps, -1 where more, at level alpha for all
         thresholds together.
@@ -42,7 +52,7 @@ class TimesPair:
     means:
         Shape (2, E): mean time below each threshold in steps.
     differences:
-        Shape (E, 3): as `difference`, for each threshold by itself.
+        Shape (E, 3): as `difference`, for each threshold; all intervals together at level 1 - alpha.
     at_cap:
         Shape (2, E): share of the runs that never reach each threshold.
     """
@@ -52,7 +62,11 @@ class TimesPair:
     alpha: float
     direction: Direction
     p: float
+    p_error: float
     difference: FloatArray = field(repr=False)
+    detectable: float
+    failed: tuple[int, int]
+    spreads: tuple[float, float]
     signs: IntArray = field(repr=False)
     p_each: FloatArray = field(repr=False)
     means: FloatArray = field(repr=False)
@@ -67,6 +81,7 @@ def times_pair(
     alpha: float = 0.05,
     horizon: int | None = None,
     seed: int = 0,
+    seconds: float = math.inf,
 ) -> TimesPair:
     """Compare two entries by their time below the grid's E thresholds.
 
@@ -82,6 +97,8 @@ def times_pair(
         Environment steps beyond which neither entry is looked at; None means the shorter horizon.
     seed:
         Of the relabelings.
+    seconds:
+        After which relabeling stops, even if the verdict may still turn.
 
     Raises
     ------
@@ -93,33 +110,58 @@ def times_pair(
     one, other = (
         times_below(entry.cut(end).values, grid, entry.steps_per_epoch) for entry in (first, second)
     )
-    verdict, p = Direction.UNDECIDED, float("nan")
+    epoch = max(first.steps_per_epoch, second.steps_per_epoch)
+    by_threshold = [with_half_epoch(each, epoch) for each in (one, other)]
+    of_runs = [each.sum(axis=1) for each in by_threshold]
+    verdict, p, p_error = Direction.UNDECIDED, math.nan, 0.0
     signs, p_each = np.zeros(grid.shape[0], dtype=np.int64), np.full(grid.shape[0], np.nan)
-    if min(len(one), len(other)) >= MIN_RUNS:
-        test = MaxT([(one, other)], seed=seed)
-        refine(test, alpha)
-        p, p_each = float(test.p[0]), test.p_each[0]
-        signs = np.where(p_each <= alpha, np.sign(test.t[0]), 0).astype(np.int64)
-        verdict = named_direction(direction(test.t[0], signs) if p <= alpha else None)
-    each = [ratio_interval(one[:, [k]], other[:, [k]], 1 - alpha) for k in range(grid.shape[0])]
+    ratio, error, freedom = (matrix[0, 1] for matrix in log_ratios([each[:, None] for each in of_runs]))
+    difference = np.array([np.expm1(ratio), np.nan, np.nan])
+    means = [each.mean(axis=0) for each in by_threshold]
+    differences = np.stack([means[0] / means[1] - 1, *np.full((2, grid.shape[0]), np.nan)], axis=1)
+    if can_decide(len(one), len(other), alpha):
+        test = MaxT([(of_runs[0][:, None], of_runs[1][:, None])], seed=seed, ratio=True)
+        [turns] = settle(test, alpha, seconds)
+        p = float(test.p[0])
+        p_error = float(np.sqrt(p * (1 - p) / test.n_relabelings[0])) if turns else 0.0
+        verdict = named_direction(int(np.sign(test.t[0, 0])) if p <= alpha else 0)
+        difference = ratio_interval(of_runs[0], of_runs[1], alpha, p <= alpha, seed)
+        each = MaxT([(by_threshold[0], by_threshold[1])], seed=seed, ratio=True)
+        each.extend(CHUNK)
+        p_each = each.p_each[0]
+        signs = np.where(p_each <= alpha, np.sign(each.t[0]), 0).astype(np.int64)
+        critical = float(each.critical(alpha)[0])
+        places = range(grid.shape[0])
+        differences = np.stack([_interval(by_threshold[0], by_threshold[1], k, critical) for k in places])
     return TimesPair(
         n_runs=(len(one), len(other)),
         horizon=end,
         alpha=alpha,
         direction=verdict,
         p=p,
-        difference=ratio_interval(one, other, 1 - alpha),
+        p_error=p_error,
+        difference=difference,
+        detectable=-math.expm1(
+            -float(error * (student_quantile(1 - alpha / 2, freedom) + student_quantile(POWER, freedom)))
+        ),
+        failed=(int((one == end).all(axis=1).sum()), int((other == end).all(axis=1).sum())),
+        spreads=(spread(of_runs[0]), spread(of_runs[1])),
         signs=signs,
         p_each=p_each,
         means=np.stack([one.mean(axis=0), other.mean(axis=0)]),
-        differences=np.array(each).reshape(-1, 3),
+        differences=differences,
         at_cap=np.stack([(times == end).mean(axis=0) for times in (one, other)]),
     )
 
 
-def ratio_interval(first: IntArray, second: IntArray, level: float) -> FloatArray:
-    """Return, shape (3,): mean of the first's times (N, E) over the second's, minus 1, and the interval of this."""
-    ratio, error, freedom = (matrix[0, 1] for matrix in log_ratios([first, second]))
-    reach = student_quantile((1 + level) / 2, freedom) * error
+def can_decide(n_first: int, n_second: int, alpha: float) -> bool:
+    """Return whether so many runs can have a verdict: 4 or more, and a labeling could have a p of at most alpha."""
+    return min(n_first, n_second) >= LEAST_RUNS and least_p(n_first, n_second) <= alpha
+
+
+def _interval(first: IntArray, second: IntArray, place: int, critical: float) -> FloatArray:
+    """Return, shape (3,), the difference at a threshold, and the interval that leaves out 0 where p is significant."""
+    ratio, error, _ = (matrix[0, 1] for matrix in log_ratios([each[:, [place]] for each in (first, second)]))
+    reach = critical * error if error else 0.0
     ends: FloatArray = np.expm1(np.array([ratio, ratio - reach, ratio + reach]))
     return ends

@@ -12,7 +12,8 @@ where the maxima rarely reach its own |t|. The t are studentized: with equal mea
 is still valid for many runs (Janssen 1997, Statistics & Probability Letters 36; Chung and Romano 2013, Annals of
 Statistics 41).
 
-Two rules are built on it: `TimesRule`, and `SkewedTimesRule` for entries with some failing runs.
+Two rules are built on it. `StepsRule` relabels the log ratio of two means of one number per run; all labelings are
+enumerated where there are few. `TimesRule` takes the largest t over the thresholds.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,7 @@ from qrlsuite.statistics.times import check_probability, times_below
 CHUNK = 10_000
 """Relabelings that are made at a time, and the least that decide."""
 _EXACT = 2**24  # float32 counts so far without error
+_ROWS = 16  # of runs that are multiplied at the same time, where there are no more pairs
 _TOGETHER = 64  # pairs whose relabelings are in memory at the same time
 
 Blocks = tuple[tuple[int, int], ...]
@@ -43,6 +46,8 @@ Blocks = tuple[tuple[int, int], ...]
 
 MOST = 10_000_000
 """Relabelings that take minutes for a board: a level that needs more is refused."""
+ENUMERATED = 100_000
+"""Labelings up to which a test of ratios takes all of them."""
 
 
 def relabelings_for(level: float) -> int:
@@ -80,6 +85,28 @@ def relabelings(n_first: int, n_second: int, chunk: int = 0, seed: int = 0, bloc
     return labels
 
 
+@functools.lru_cache(maxsize=8)
+def all_labelings(n_first: int, n_second: int) -> BoolArray:
+    """Return every labeling of two entries' runs, (n_first + n_second, labelings), as `relabelings` does."""
+    chosen = np.array(list(combinations(range(n_first + n_second), n_first)))
+    labels = np.zeros((n_first + n_second, len(chosen)), dtype=bool)
+    labels[chosen.T, np.arange(len(chosen))] = True
+    labels.flags.writeable = False
+    return labels
+
+
+def few_labelings(n_first: int, n_second: int) -> int | None:
+    """Return the number of all labelings where a test of ratios takes all of them, else None."""
+    count = math.comb(n_first + n_second, n_first)
+    return count if count <= ENUMERATED else None
+
+
+@functools.lru_cache(maxsize=16)
+def weights(n_first: int, n_second: int, seed: int, block: int, chunk: int = 0) -> FloatArray:
+    """Return `relabelings` as numbers that are multiplied fast."""
+    return relabelings(n_first, n_second, chunk, seed, block).astype(np.float64)
+
+
 def smallest(keys: NDArray[np.uint32], count: int) -> BoolArray:
     """Return, shape (R, n), which are the `count` smallest keys of each row; among equal ones the first."""
     chosen: BoolArray = keys <= np.sort(keys, axis=1)[:, count - 1 : count]
@@ -90,7 +117,7 @@ def smallest(keys: NDArray[np.uint32], count: int) -> BoolArray:
 
 
 class MaxT:
-    """Max-T permutation tests of P pairs over E comparisons: the difference of means, studentized (Welch).
+    """Max-T permutation tests of P pairs over E comparisons: the difference or ratio of means, studentized.
 
     Parameters
     ----------
@@ -102,14 +129,14 @@ class MaxT:
         within a block only. None means a single block. Relabelings of a block do not depend on later blocks.
     seed:
         Of the relabelings.
-    skewed:
-        Whether t is corrected for skewness, see `skewed_t`.
+    ratio:
+        Whether t is that of the log ratio of two means of positive numbers, see `ratio_t`, and not of their difference.
 
     Attributes
     ----------
     t:
-        Shape (P, E): Welch's t, positive where the first has the smaller mean; infinite where neither entry
-        varies and they differ, 0 where nothing differs. Corrected for skewness where this was asked for.
+        Shape (P, E): Welch's t or that of the log ratio, positive where the first has the smaller mean; infinite where
+        neither entry varies and they differ, 0 where nothing differs.
     reached:
         Shape (P, E): relabelings whose max |t| is at least |t| here.
     n_relabelings:
@@ -126,25 +153,62 @@ class MaxT:
         pairs: Sequence[tuple[IntArray, IntArray]],
         blocks: Blocks | None = None,
         seed: int = 0,
-        skewed: bool = False,
+        ratio: bool = False,
     ) -> None:
-        self.seed = seed
-        self._kind = _SkewedStatistics if skewed else _Statistics
-        self._swapped = [_in_order(*pair) for pair in pairs]
+        self.seed, self.ratio = seed, ratio
+        self._kind = _RatioStatistics if ratio else _Statistics
+        self._swapped = [in_order(*pair) for pair in pairs]
         ordered = [pair[::-1] if swap else pair for pair, swap in zip(pairs, self._swapped, strict=True)]
         self._pairs: list[tuple[IntArray, IntArray]] = [(first, second) for first, second in ordered]
         self._blocks = [_checked_blocks(pair, blocks, swap) for pair, swap in zip(self._pairs, self._swapped)]
         shape = (len(pairs), pairs[0][0].shape[1] if pairs else 0)
-        t = skewed_t if skewed else welch_t
+        t = ratio_t if ratio else welch_t
         self.t = np.array([t(*pair) for pair in pairs]).reshape(shape)
         self.reached = np.zeros(shape, dtype=np.int64)
         self.n_relabelings = np.zeros(len(pairs), dtype=np.int64)
 
     @property
     def p_each(self) -> FloatArray:
-        """Shape (P, E): p of every comparison, adjusted for all comparisons of its pair."""
+        """Shape (P, E): p of every comparison, adjusted for all comparisons of its pair.
+
+        Of a ratio the share of relabelings, since their number depends on the data (Gandy 2009, Journal of the American
+        Statistical Association 104); where none reaches |t|, less than a single one.
+        """
+        if self.ratio:
+            none = 1 / (1 + self.n_relabelings)[:, None]
+            shares: FloatArray = self.reached / np.maximum(1, self.n_relabelings)[:, None]
+            return np.where(self.reached, shares, none)
         p: FloatArray = (1 + self.reached) / (1 + self.n_relabelings)[:, None]
         return p
+
+    def critical(self, level: float) -> FloatArray:
+        """Return, shape (P,), the |t| that a comparison of a ratio must exceed for an adjusted p of at most `level`.
+
+        By the first ten thousand relabelings, or by all labelings.
+        """
+        bounds = []
+        for pair, blocks in zip(self._pairs, self._blocks):
+            if len(blocks) == 1 and few_labelings(*blocks[0]) is not None:
+                labels = [all_labelings(*blocks[0])]
+            else:
+                labels = [relabelings(*sizes, 0, self.seed, block) for block, sizes in enumerate(blocks)]
+            largest = np.sort(self._kind([pair], blocks).largest(labels)[0])[::-1]
+            bounds.append(float(largest[min(int(level * len(largest)), len(largest) - 1)]))
+        return np.array(bounds)
+
+    def turns(self, levels: FloatArray, risk: float) -> BoolArray:
+        """Return, shape (P,), whether a pair's p may still cross its level.
+
+        Robbins' confidence sequence (1970, Annals of Mathematical Statistics 41): it holds p at all numbers of
+        relabelings at once, but for a probability of `risk`.
+        """
+        from scipy.special import gammaln, xlog1py, xlogy
+
+        reached, count = self.reached.min(axis=1), self.n_relabelings
+        likely = gammaln(count + 2) - gammaln(reached + 1) - gammaln(count - reached + 1)
+        likely += xlogy(reached, levels) + xlog1py(count - reached, -levels)
+        exact = [few_labelings(*map(len, pair)) == n for pair, n in zip(self._pairs, count.tolist())]
+        return np.asarray((likely > math.log(risk)) & ~np.array(exact, dtype=bool))
 
     @property
     def p(self) -> FloatArray:
@@ -162,12 +226,17 @@ class MaxT:
             for begin in range(0, len(members), _TOGETHER):
                 group = members[begin : begin + _TOGETHER]
                 statistics = self._kind([self._pairs[index] for index in group], blocks)
-                for chunk in range(done // CHUNK, n_relabelings // CHUNK):
-                    self.reached[group] += statistics.count(chunk, self.seed)
-                    self.n_relabelings[group] += CHUNK
+                count = few_labelings(*blocks[0]) if self.ratio and len(blocks) == 1 else None
+                if count is not None:
+                    self.reached[group] = statistics.counted([all_labelings(*blocks[0])])
+                    self.n_relabelings[group] = count
+                    continue
+                chunks = range(done // CHUNK, n_relabelings // CHUNK)
+                self.reached[group] += statistics.count(chunks, self.seed)
+                self.n_relabelings[group] += CHUNK * len(chunks)
 
 
-def _in_order(first: IntArray, second: IntArray) -> bool:
+def in_order(first: IntArray, second: IntArray) -> bool:
     """Return whether a pair is to be swapped: by its content, so that the answer hangs on no order of names."""
     if len(first) != len(second):
         return len(first) > len(second)
@@ -196,57 +265,37 @@ def welch_t(first: IntArray, second: IntArray) -> FloatArray:
     return t
 
 
-def skewed_t(first: IntArray, second: IntArray) -> FloatArray:
-    """Return Welch's t corrected for the skewness of the difference, shape (E,), see `welch_t`.
-
-    Hall's cubic, which increases with t (Hall 1992, Journal of the Royal Statistical Society B 54). Rare failures make
-    times skewed: where few of them have occurred, mean and spread are both too small, and t is too large.
-    """
+def ratio_t(first: IntArray, second: IntArray) -> FloatArray:
+    """Return the log ratio of two means over its standard error (delta method), shape (E,), see `welch_t`."""
     sides = [
-        _Cumulants.of([(each.astype(np.float64) ** power).sum(axis=0) for power in (1, 2, 3)], len(each))
-        for each in _centered(first, second)
+        (len(each), each.sum(axis=0), (each.astype(np.float64) ** 2).sum(axis=0)) for each in (first, second)
     ]
-    return _hall(*sides)
+    ratio, variance = log_ratio(*sides)
+    return studentized(ratio, variance)
 
 
-def _centered(first: IntArray, second: IntArray) -> list[FloatArray]:
-    middle = np.concatenate([first, second]).mean(axis=0)
-    return [first - middle, second - middle]
+Sums = tuple[int, NDArray[Any], NDArray[Any]]
+"""Number of runs, their sum and the sum of their squares; the latter elementwise."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Cumulants:
-    """Mean of some runs, and the variance and third cumulant of this mean, elementwise."""
-
-    mean: FloatArray
-    variance: FloatArray
-    third: FloatArray
-
-    @classmethod
-    def of(cls, sums: Sequence[FloatArray], count: int) -> _Cumulants:
-        """Return them from the sums of the runs, of their squares and of their cubes."""
-        mean, square, cube = (each / count for each in sums)
-        of_mean = mean * mean
-        variance = square - of_mean
-        third = cube - mean * (3 * square - 2 * of_mean)
-        nothing = variance <= 1e-12 * square  # what rounding leaves of zero
-        variance[nothing] = third[nothing] = 0
-        return cls(mean, variance / (count - 1), third / count**2)
+def log_ratio(first: Sums, second: Sums) -> tuple[FloatArray, FloatArray]:
+    """Return the log of the second's mean over the first's, and its variance by the delta method, elementwise."""
+    variance: FloatArray | float = 0.0
+    for count, total, square in (first, second):
+        relative = square * (count / total**2) - 1
+        relative[relative < 1e-12] = 0  # what rounding leaves of zero
+        variance = variance + relative / (count - 1)
+    ratio = np.log(second[1] / second[0]) - np.log(first[1] / first[0])
+    ratio[np.abs(ratio) < 1e-12] = 0
+    return ratio, np.asarray(variance)
 
 
-def _hall(first: _Cumulants, second: _Cumulants) -> FloatArray:
-    """Return Hall's cubic of Welch's t: positive where the first has the smaller mean."""
-    difference, variance = second.mean - first.mean, first.variance + second.variance
-    difference[np.abs(difference) <= 1e-12 * (np.abs(first.mean) + np.abs(second.mean))] = 0
-    error = np.sqrt(variance)
+def studentized(ratio: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return a ratio over the root of its variance: 0 where it is 0, infinite where it alone does not vary."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = difference / error
-        skewness = (second.third - first.third) / (variance * error)
-        part = skewness * t / 3
-        corrected: FloatArray = t * (1 + part * (1 + part / 3)) + skewness / 6
-    flat = variance == 0
-    corrected[flat] = np.where(difference[flat] == 0, 0, np.copysign(np.inf, difference[flat]))
-    return corrected
+        t = ratio / np.sqrt(variance)
+    t[ratio == 0] = 0
+    return t
 
 
 class _Statistics:
@@ -257,6 +306,8 @@ class _Statistics:
     unequal numbers it is t^2. Sums are whole numbers and exact, so that ties are ties on every machine.
     """
 
+    in_float32 = True  # where sums are exact
+
     def __init__(self, pairs: Sequence[tuple[IntArray, IntArray]], blocks: Blocks) -> None:
         self.blocks = blocks
         self.sizes = tuple(np.sum(blocks, axis=0).tolist())
@@ -266,39 +317,54 @@ class _Statistics:
         rows = np.ascontiguousarray(np.moveaxis(pooled // unit, 2, 0)).reshape(
             -1, pooled.shape[1]
         )  # (E P, n)
-        rows -= np.rint(rows.mean(axis=1)).astype(np.int64)[
-            :, None
-        ]  # small numbers lose least in differences
+        self._shift(rows)
         labels = np.concatenate([np.repeat([1, 0], block) for block in blocks])
         self.totals, self.squares = rows.sum(axis=1), (rows**2).sum(axis=1)
         self.equal = self.sizes[0] == self.sizes[1]
         summed = self._powers(rows)
         self.all_runs = [each.sum(axis=1) for each in summed]
         largest = max(2 * int(np.abs(each).sum(axis=1).max()) for each in summed)
-        self.kind: Any = np.float32 if largest < _EXACT else np.float64
+        self.kind: Any = np.float32 if largest < _EXACT and self.in_float32 else np.float64
         self.matrices = [each.astype(self.kind) for each in summed]
         observed = [(each @ labels)[:, None].astype(self.kind) for each in summed]
         self.observed = self._of(observed).reshape(self.n_comparisons, self.n_pairs)
+
+    def _shift(self, rows: IntArray) -> None:
+        """Move every row to small numbers, which lose least in differences."""
+        rows -= np.rint(rows.mean(axis=1)).astype(np.int64)[:, None]
 
     def _powers(self, rows: IntArray) -> list[NDArray[Any]]:
         """Return the powers of the runs whose sums are needed."""
         return [rows] if self.equal else [rows, rows**2]
 
-    def count(self, chunk: int, seed: int) -> IntArray:
-        """Return, shape (P, E), how many relabelings of a chunk have a maximum of at least the observed."""
-        labels = [relabelings(*sizes, chunk, seed, block) for block, sizes in enumerate(self.blocks)]
-        sums = [self._sum(matrix, labels) for matrix in self.matrices]
-        largest = self._of(sums).reshape(self.n_comparisons, self.n_pairs, CHUNK).max(axis=0)
+    def count(self, chunks: range, seed: int) -> IntArray:
+        """Return, shape (P, E), how many relabelings of these chunks have a maximum of at least the observed."""
+        reached = np.zeros((self.n_pairs, self.n_comparisons), dtype=np.int64)
+        for chunk in chunks:
+            reached += self.counted(
+                [relabelings(*sizes, chunk, seed, block) for block, sizes in enumerate(self.blocks)]
+            )
+        return reached
+
+    def counted(self, labels: Sequence[NDArray[Any]]) -> IntArray:
+        """Return, shape (P, E), how many of these labelings, by block, have a maximum of at least the observed."""
+        largest = self.largest(labels)
         return np.stack(
             [np.count_nonzero(largest >= each[:, None], axis=1) for each in self.observed], axis=1
         )
 
-    def _sum(self, matrix: NDArray[Any], labels: Sequence[BoolArray]) -> NDArray[Any]:
+    def largest(self, labels: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Return, shape (P, labelings), the largest statistic of each labeling."""
+        sums = [self._sum(matrix, labels) for matrix in self.matrices]
+        found: NDArray[Any] = self._of(sums).reshape(self.n_comparisons, self.n_pairs, -1).max(axis=0)
+        return found
+
+    def _sum(self, matrix: NDArray[Any], labels: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Return, shape (E P, relabelings), the sum over the runs labeled "first"."""
         ends = np.cumsum([len(each) for each in labels]).tolist()
         total: NDArray[Any] | None = None
         for end, each in zip(ends, labels):
-            columns, weights = matrix[:, end - len(each) : end], each.astype(self.kind)
+            columns, weights = matrix[:, end - len(each) : end], each.astype(self.kind, copy=False)
             part = small_product(columns, weights) if self.kind is np.float32 else columns @ weights
             total = part if total is None else np.add(total, part, out=total)
         assert total is not None
@@ -335,25 +401,63 @@ class _Statistics:
         return first
 
 
-class _SkewedStatistics(_Statistics):
-    """|t| corrected for skewness: sums of squares and cubes are needed, too, and rounding is allowed for."""
+class _RatioStatistics(_Statistics):
+    """|t| of the log ratio of means, see `ratio_t`: of sums and sums of squares, and rounding is allowed for."""
+
+    in_float32 = False
+
+    def _shift(self, rows: IntArray) -> None:
+        pass
+
+    def count(self, chunks: range, seed: int) -> IntArray:
+        """As for any statistic; but every chunk has the labelings of the first, of runs in another random order.
+
+        So each labeling is as likely as any other, and is made in a tenth of the time.
+        """
+        labels = [weights(*sizes, seed, block) for block, sizes in enumerate(self.blocks)]
+        reached = np.zeros((self.n_pairs, self.n_comparisons), dtype=np.int64)
+        given, together = self.matrices, max(1, _ROWS // len(self.totals))
+        for begin in range(chunks.start, chunks.stop, together):
+            orders = [self._order(chunk, seed) for chunk in chunks[begin - chunks.start :][:together]]
+            self.matrices = [np.concatenate([matrix[:, each] for each in orders]) for matrix in given]
+            reached += self.counted(labels)
+        self.matrices = given
+        return reached
+
+    def _order(self, chunk: int, seed: int) -> IntArray:
+        """Return the order of the runs in a chunk: shuffled within blocks, but for the first."""
+        generator, sizes = np.random.default_rng([seed, chunk]), [sum(block) for block in self.blocks]
+        shuffled = generator.permutation if chunk else np.arange
+        return np.concatenate([begin + shuffled(n) for begin, n in zip(np.cumsum([0, *sizes]), sizes)])
 
     def _powers(self, rows: IntArray) -> list[NDArray[Any]]:
-        return [rows.astype(np.float64) ** power for power in (1, 2, 3)]
+        return [rows, rows.astype(np.float64) ** 2]
 
-    def count(self, chunk: int, seed: int) -> IntArray:
-        """Return, shape (P, E), how many relabelings of a chunk have a maximum of at least the observed."""
-        exact = self.observed
-        self.observed = exact * (1 - 1e-9)
-        counted = super().count(chunk, seed)
-        self.observed = exact
-        return counted
+    def counted(self, labels: Sequence[NDArray[Any]]) -> IntArray:
+        """Return, shape (P, E), how many of these labelings, by block, have a maximum of at least the observed."""
+        largest = self.largest(labels)
+        return np.stack(
+            [
+                np.count_nonzero(largest >= each[:, None] * (1 - 1e-9), axis=1)
+                for each in self.observed.astype(np.float64)
+            ],
+            axis=1,
+        )
+
+    def largest(self, labels: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Return, shape (P, labelings), the largest statistic of each labeling; both powers are summed at once."""
+        sums = np.split(self._sum(np.concatenate(self.matrices), labels), 2)
+        t = self._of(sums).reshape(-1, self.n_comparisons, self.n_pairs, sums[0].shape[1]).max(axis=1)
+        found: NDArray[Any] = np.moveaxis(t, 0, 1).reshape(self.n_pairs, -1)
+        return found
 
     def _of(self, sums: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        ours = [each.astype(np.float64) for each in sums]
-        theirs = [total[:, None] - each for total, each in zip(self.all_runs, ours)]
-        first, second = (_Cumulants.of(each, count) for each, count in zip((ours, theirs), self.sizes))
-        return np.abs(_hall(first, second))
+        copies = len(sums[0]) // len(self.totals)
+        ours = [each.astype(np.float64, copy=False) for each in sums]
+        theirs = [np.tile(total, copies)[:, None] - each for total, each in zip(self.all_runs, ours)]
+        sides = ((count, *each) for count, each in zip(self.sizes, (ours, theirs)))
+        ratio, variance = log_ratio(*sides)
+        return np.abs(studentized(ratio, variance))
 
 
 def _interleaved(pair: tuple[IntArray, IntArray], blocks: Blocks) -> IntArray:
@@ -393,11 +497,6 @@ class TimesRule:
         return "times"
 
     @property
-    def skewed(self) -> bool:
-        """Whether t is corrected for skewness."""
-        return False
-
-    @property
     def promise(self) -> str:
         """What the rule controls."""
         return (
@@ -415,34 +514,49 @@ class TimesRule:
         """Return the signs of one entry against M others, shape (M, E, D)."""
         own = times_of(first)
         pairs = [(own, times_of(other)) for other in others]
-        test = MaxT(pairs, seed=first.resampling.seed, skewed=self.skewed)
+        test = MaxT(pairs, seed=first.resampling.seed)
         test.extend(relabelings_for(self.alpha))
         signs = np.where(test.p_each <= self.alpha, np.sign(test.t), 0).astype(np.int8)
         return np.repeat(signs[:, :, None], first.grid.shape[1], axis=2)
 
 
 @dataclass(frozen=True, slots=True)
-class SkewedTimesRule(TimesRule):
-    """`TimesRule` with a t that is corrected for skewness (`skewed_t`), for entries with some failing runs."""
+class StepsRule(TimesRule):
+    """Significant where the mean steps below all thresholds differ: every cell gets the sign of the pair.
+
+    The statistic is the log ratio of the two means, with half an epoch added, over its standard error (`ratio_t`),
+    among relabelings of whole runs.
+    """
 
     @property
     def name(self) -> str:
         """The rule's name."""
-        return "times-skewed"
-
-    @property
-    def skewed(self) -> bool:
-        """Whether t is corrected for skewness."""
-        return True
+        return "steps"
 
     @property
     def promise(self) -> str:
         """What the rule controls."""
         return (
-            f"all tolerances of one pair: two entries of equal law differ significantly at any with probability "
-            f"{self.alpha:g} at most; for equal means but unequal laws about so, where a failing run is likely to have "
-            "occurred; not the direction, and not the whole board of many pairs"
+            f"mean steps of one pair: two entries of equal law differ significantly with probability {self.alpha:g} at "
+            "most; for equal means but unequal laws about so, if both have many runs; not the direction, and not the "
+            "whole board of many pairs"
         )
+
+    def against(self, first: Evidence, others: Sequence[Evidence]) -> Signs:
+        """Return the signs of one entry against M others, shape (M, E, D)."""
+        epoch = max(each.steps_per_epoch for each in (first, *others))
+        own, *rest = (
+            with_half_epoch(times_of(each), epoch).sum(axis=1, keepdims=True) for each in (first, *others)
+        )
+        test = MaxT([(own, each) for each in rest], seed=first.resampling.seed, ratio=True)
+        test.extend(relabelings_for(self.alpha))
+        signs = np.where(test.p_each <= self.alpha, np.sign(test.t), 0).astype(np.int8)
+        return np.broadcast_to(signs[:, :, None], (len(others), *first.grid.shape)).copy()
+
+
+def with_half_epoch(times: IntArray, epoch: int) -> IntArray:
+    """Return twice the times below threshold, in steps, with half an epoch's steps added: never 0, and whole."""
+    return 2 * times + epoch
 
 
 def times_of(evidence: Evidence) -> IntArray:

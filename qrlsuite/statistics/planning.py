@@ -17,7 +17,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.grid import Grid, IntArray, whole
 from qrlsuite.statistics.sequential import Decided, Decision, PairDecision, SequentialDesign, Spending
-from qrlsuite.statistics.simulation import SmoothedRuns, draw_times, judge_times, play, slower
+from qrlsuite.statistics.simulation import SmoothedRuns, draw_steps, judge_steps, play, slower
 from qrlsuite.statistics.times import check_probability
 
 LADDER = (20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400)
@@ -93,7 +93,7 @@ def runs_needed(
         check_probability(power, "power")
     largest, count = whole(most, "most", at_least=MIN_RUNS), whole(n_pairs, "n_pairs", at_least=1)
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
-    drawn = [draw_times(model, largest, count, grid, generator) for model in (first, second)]
+    drawn = [draw_steps(model, largest, count, grid, generator) for model in (first, second)]
     fixed = _fixed(drawn, powers, alpha, largest)
     return tuple(_with_plan(drawn, power, runs, alpha, spending) for power, runs in zip(powers, fixed))
 
@@ -137,7 +137,7 @@ def _fixed(drawn: Sequence[IntArray], powers: Sequence[float], alpha: float, mos
     """Return, for each power, the runs that reach it, interpolated between two rungs of the ladder."""
     tried, reached_powers = [0], [0.0]
     for n_runs in sorted({*(rung for rung in LADDER if rung < most), most}):
-        rates = judge_times(drawn[0][:, :n_runs], drawn[1][:, :n_runs], alpha)
+        rates = judge_steps(drawn[0][:, :n_runs], drawn[1][:, :n_runs], alpha)
         tried.append(n_runs)
         reached_powers.append(max(rates.first, reached_powers[-1]))
         if reached_powers[-1] >= max(powers):
@@ -175,7 +175,7 @@ def _with_plan(
         most = math.ceil(factor * fixed)
         if most > drawn[0].shape[1]:
             break
-        design = SequentialDesign(("first", "second"), even_looks(most), alpha, spending)
+        design = SequentialDesign(("first", "second"), even_looks(most), alpha, spending, rule="steps")
         rates = play(design, [each[:, :most] for each in drawn])
         if rates.verdicts[0][Decided.FIRST] >= power:
             return Need(power, fixed, design.looks, rates.mean_runs[0])

@@ -7,7 +7,8 @@ Ye, Li, Liu and Yao 2013, Statistics in Medicine 32): every pair that is not yet
 belong to alpha / number of such pairs, and after a rejection again with one less. The family is all pairs that were
 planned. A pair that is closed as equal is not rejected: it keeps its share of alpha.
 
-The test is the test of rule `times` (`MaxT`); labels are exchanged within the block of seeds that each look added.
+The test is the test of rule `steps` or `times` (`MaxT`); labels are exchanged within the block of seeds that each look
+added. By `steps`, relabelings of a look go on until no decision can turn.
 A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
 1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
 
@@ -30,14 +31,16 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
-from qrlsuite.statistics.permutation import Blocks, MaxT, relabelings_for
+from qrlsuite.statistics.permutation import CHUNK, MOST, Blocks, MaxT, relabelings_for, with_half_epoch
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
-from qrlsuite.statistics.times_board import direction, log_ratios
+from qrlsuite.statistics.times_board import log_ratios
 
-RULES = ("times", "times-skewed")
+RULES = ("times", "steps")
 """Rules that may judge the pairs of a design."""
 MOST_RELABELINGS = 200_000
 """At levels below 1e-4 a difference needs p = 1 / 200,001 or so; at levels below that there is none."""
+SETTLED_RISK = 1e-3
+"""Probability that more relabelings would turn a decision of a look by rule `steps`."""
 _POINTS = 1001  # of the numerical integration
 _TAIL = 9.0  # standard deviations beyond which a density is nothing
 
@@ -188,7 +191,7 @@ class SequentialDesign:
     reason:
         Why the first look comes before 20 runs.
     rule:
-        `times`, or `times-skewed`: with a t that is corrected for skewness.
+        `steps`; or `times`, as studies of earlier versions have it.
 
     Raises
     ------
@@ -286,7 +289,7 @@ class PairDecision:
     n_runs:
         Runs of each at its last look, 0 before the first.
     p, levels:
-        Max-T p and the level it was compared with last, at each look so far.
+        p and the level it was compared with last, at each look so far.
     difference:
         Mean time of the second over mean time of the first, minus 1, at the last look. After an early stop it is biased
         away from 0.
@@ -298,9 +301,10 @@ class PairDecision:
     margin:
         As in the design.
     leading:
-        Number of the threshold with the largest |t| at the last look, which gave the pair its p.
+        Number of the threshold with the largest |t| at the last look, which gave the pair its p; 0 by rule `steps`.
     leading_difference, leading_interval:
-        As `difference`, at this threshold alone; the interval is at the level that p was compared with last.
+        As `difference`, at this threshold alone; the interval is at the level that p was compared with last. By rule
+        `steps` there is none: NaN.
     """
 
     first: str
@@ -321,6 +325,20 @@ class PairDecision:
     def differs(self) -> bool:
         """Whether the pair was found to differ."""
         return self.decided in (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF)
+
+    @property
+    def at_threshold(self) -> bool:
+        """Whether a threshold decided, by rule `times`, while the interval of the mean holds 0."""
+        low, high = self.interval
+        one_sided = self.decided in (Decided.FIRST, Decided.SECOND)
+        return one_sided and low <= 0 <= high and math.isfinite(self.leading_difference)
+
+    @property
+    def shown(self) -> tuple[float, float, float]:
+        """Difference and interval of what decided: of the mean, or of the threshold where `at_threshold`."""
+        if self.at_threshold:
+            return self.leading_difference, *self.leading_interval
+        return self.difference, *self.interval
 
     @property
     def verdict(self) -> str:
@@ -391,12 +409,11 @@ def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: G
     ends = {name: entry.horizon for name, entry in runs.items()}
     if len(set(ends.values())) > 1:
         raise OptionError(f"the entries end at different horizons: {ends}; cut them to one")
-    times = {name: times_below(each.values, grid, each.steps_per_epoch) for name, each in runs.items()}
-    return decide_times(design, times)
-
-
-def decide_times(design: SequentialDesign, times: Mapping[str, IntArray]) -> Decision:
-    """Return a design's decision from times below threshold, (N, E) for each entry: see `decide`."""
+    epoch = max((each.steps_per_epoch for each in runs.values()), default=1)
+    times = {
+        name: judged_numbers(design, times_below(each.values, grid, each.steps_per_epoch), epoch)
+        for name, each in runs.items()
+    }
     pairs = begin(design)
     for look, n_runs in enumerate(design.looks):
         wanted = wanted_at(pairs, n_runs)
@@ -404,6 +421,11 @@ def decide_times(design: SequentialDesign, times: Mapping[str, IntArray]) -> Dec
             return Decision(design, tuple(pairs), wanted)
         [pairs] = next_look(design, look, [pairs], [times])
     return Decision(design, tuple(pairs), {})
+
+
+def judged_numbers(design: SequentialDesign, times: IntArray, epoch: int) -> IntArray:
+    """Return what a design's rule judges, given times below threshold (..., N, E): the same, or one number per run."""
+    return times if design.rule == "times" else with_half_epoch(times, epoch).sum(axis=-1, keepdims=True)
 
 
 def begin(design: SequentialDesign) -> list[PairDecision]:
@@ -421,6 +443,7 @@ def next_look(
     look: int,
     studies: Sequence[Sequence[PairDecision]],
     times: Sequence[Mapping[str, IntArray]],
+    settled: bool = True,
 ) -> list[list[PairDecision]]:
     """Return the pairs of several studies of one design after look 0, 1, ...; closed pairs are unchanged.
 
@@ -431,7 +454,9 @@ def next_look(
     studies:
         For each study the pairs as the look before left them.
     times:
-        For each study the times of its entries, (N, E) with N at least the look's runs.
+        For each study the `judged_numbers` of its entries, (N, E) with N at least the look's runs.
+    settled:
+        Whether relabelings of rule `steps` go on until no decision can turn; simulations do without.
     """
     n_runs = design.looks[look]
     todo = [
@@ -446,8 +471,11 @@ def next_look(
     for study, index in todo:
         pair = studies[study][index]
         data.append((times[study][pair.first][:n_runs], times[study][pair.second][:n_runs]))
-    test = MaxT(data, design.blocks[: look + 1], design.seed, skewed=design.rule == "times-skewed")
-    test.extend(min(relabelings_for(design.level(look, len(design.family))), MOST_RELABELINGS))
+    test = MaxT(data, design.blocks[: look + 1], design.seed, ratio=design.rule == "steps")
+    if test.ratio and settled:
+        _settle(test, [design.level(look, 1 + others) for others in range(len(design.family))])
+    else:
+        test.extend(min(relabelings_for(design.level(look, len(design.family))), MOST_RELABELINGS))
     p, p_each = test.p, test.p_each
     result = [list(pairs) for pairs in studies]
     rows: dict[int, dict[int, int]] = {}  # of each study: the row of the test for each open pair
@@ -457,9 +485,22 @@ def next_look(
     for study, of_study in rows.items():
         _reject(design, look, result[study], of_study, test.t, p_each)
         for index, row in of_study.items():
-            result[study][index] = _led(result[study][index], data[row], test.t[row])
+            if not test.ratio:
+                result[study][index] = _led(result[study][index], data[row], test.t[row])
+            elif settled:
+                result[study][index] = _relabeled(result[study][index], data[row], test, row)
         _close(design, look, result[study])
     return result
+
+
+def _settle(test: MaxT, levels: Sequence[float]) -> None:
+    """Relabel until no p can cross any of the levels, or 10 million times."""
+    count, which = CHUNK, np.arange(len(test.t))
+    while len(which):
+        test.extend(count, which)
+        turns = [test.turns(np.full(len(test.t), level), SETTLED_RISK / len(test.t)) for level in levels]
+        which = np.flatnonzero(np.any(turns, axis=0) & (test.n_relabelings < MOST))
+        count = min(2 * count, MOST)
 
 
 def _looked(
@@ -494,6 +535,14 @@ def _led(pair: PairDecision, data: tuple[IntArray, IntArray], t: FloatArray) -> 
     first, second = (each[:, [leading]] for each in data)
     difference, interval = _repeated((first, second), pair.levels[-1])
     return replace(pair, leading=leading, leading_difference=difference, leading_interval=interval)
+
+
+def _relabeled(pair: PairDecision, data: tuple[IntArray, IntArray], test: MaxT, row: int) -> PairDecision:
+    """Return a pair with the interval that relabelings give at the level that its p was compared with."""
+    ratio, error, _ = _log_ratio(data)
+    reach = float(test.critical(pair.levels[-1])[row]) * error if error else 0.0
+    reach = min(reach, abs(ratio) * (1 - 1e-9)) if pair.differs else max(reach, abs(ratio))
+    return replace(pair, interval=(math.expm1(ratio - reach), math.expm1(ratio + reach)))
 
 
 def _log_ratio(data: Sequence[IntArray]) -> tuple[float, float, float]:
@@ -535,6 +584,13 @@ def _reject(
             pairs[index] = replace(pairs[index], decided=decided)
     for index in rows:
         pairs[index] = replace(pairs[index], levels=(*pairs[index].levels, level))
+
+
+def direction(t: FloatArray, signs: IntArray) -> int:
+    """Return 1 or -1, the sign of the largest |t| of (E,), or 0 if significant signs of (E,) are of both kinds."""
+    if (signs > 0).any() and (signs < 0).any():
+        return 0
+    return int(np.sign(t[np.abs(t).argmax()]))
 
 
 def _close(design: SequentialDesign, look: int, pairs: list[PairDecision]) -> None:

@@ -1,7 +1,7 @@
 """Simulated runs that resemble an entry's, to compute how often a comparison or a design finds a difference.
 
-`SmoothedRuns` draws independent runs from a smoothed model of an entry's curves, at any number of runs. `judge_times`
-returns the findings of rule `times` in many pairs, and `decision_rates` plays whole sequential designs. Error rates of
+`SmoothedRuns` draws independent runs from a smoothed model of an entry's curves, at any number of runs. `judge_steps`
+returns the findings of rule `steps` in many pairs, and `decision_rates` plays whole sequential designs. Error rates of
 other rules are measured in `benchmarks/simulated.py`.
 """
 
@@ -15,8 +15,8 @@ import numpy as np
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
-from qrlsuite.statistics.permutation import MaxT, relabelings_for
-from qrlsuite.statistics.sequential import Decided, SequentialDesign, begin, next_look
+from qrlsuite.statistics.permutation import MaxT, relabelings_for, with_half_epoch
+from qrlsuite.statistics.sequential import Decided, SequentialDesign, begin, judged_numbers, next_look
 from qrlsuite.statistics.times import times_below
 
 _DRAWN = 5_000  # runs that are drawn at a time
@@ -112,45 +112,33 @@ def draw_times(
     return np.concatenate(drawn).reshape(entries, runs, -1)
 
 
+def draw_steps(
+    model: SmoothedRuns, n_runs: int, n_entries: int, grid: Grid, generator: np.random.Generator
+) -> IntArray:
+    """Return what rule `steps` judges of independent entries, shape (n_entries, n_runs, 1): one number per run."""
+    times = draw_times(model, n_runs, n_entries, grid, generator)
+    return np.asarray(with_half_epoch(times, model.entry.steps_per_epoch).sum(axis=2, keepdims=True))
+
+
 @dataclass(frozen=True, slots=True)
-class TimesRates:
-    """Rates of the findings of rule `times`, over many simulated pairs.
+class StepsRates:
+    """Fractions of many simulated pairs in which rule `steps` finds that the first or the second needs fewer steps."""
 
-    Attributes
-    ----------
-    n_runs:
-        Runs of the first and the second entry.
-    n_pairs:
-        Simulated pairs.
-    first, second, trade_off:
-        Fraction of pairs in which the first, the second needs fewer, and with thresholds of both signs.
-    """
-
-    n_runs: tuple[int, int]
-    n_pairs: int
     first: float
     second: float
-    trade_off: float
 
     @property
     def found(self) -> float:
-        """Fraction of pairs with a difference at any threshold: the error between equals."""
-        return self.first + self.second + self.trade_off
+        """Fraction of pairs with a difference: the error between equals."""
+        return self.first + self.second
 
 
-def judge_times(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> TimesRates:
-    """Return the rates of the findings of rule `times` in P pairs of times, (P, N_A, E) and (P, N_B, E)."""
-    test = MaxT(list(zip(ours, theirs)))
+def judge_steps(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> StepsRates:
+    """Return the findings of rule `steps` in P pairs of one number per run, (P, N_A, 1) and (P, N_B, 1)."""
+    test = MaxT(list(zip(ours, theirs)), ratio=True)
     test.extend(relabelings_for(alpha))
-    signs = np.where(test.p_each <= alpha, np.sign(test.t), 0)
-    fewer, more = (signs > 0).any(axis=1), (signs < 0).any(axis=1)
-    return TimesRates(
-        n_runs=(ours.shape[1], theirs.shape[1]),
-        n_pairs=len(ours),
-        first=float((fewer & ~more).mean()),
-        second=float((more & ~fewer).mean()),
-        trade_off=float((fewer & more).mean()),
-    )
+    signs = np.where(test.p <= alpha, np.sign(test.t[:, 0]), 0)
+    return StepsRates(float((signs > 0).mean()), float((signs < 0).mean()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +187,11 @@ def decision_rates(
         raise OptionError(f"{len(models)} models for the {len(design.entries)} entries of the design")
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
     count = whole(n_studies, "n_studies", at_least=1)
-    drawn = [draw_times(model, design.looks[-1], count, grid, generator) for model in models]
+    epoch = max(model.entry.steps_per_epoch for model in models)
+    drawn = [
+        judged_numbers(design, draw_times(model, design.looks[-1], count, grid, generator), epoch)
+        for model in models
+    ]
     rates = play(design, drawn)
     if tick is not None:
         for _ in range(count):
@@ -208,12 +200,12 @@ def decision_rates(
 
 
 def play(design: SequentialDesign, drawn: Sequence[IntArray]) -> DecisionRates:
-    """Return a design's rates on times of each entry, (studies, N, E) with N the runs of the last look."""
+    """Return a design's rates on `judged_numbers` of each entry, (studies, N, E) with N the runs of the last look."""
     count = len(drawn[0])
     times = [{name: each[k] for name, each in zip(design.entries, drawn)} for k in range(count)]
     studies = [list(begin(design)) for _ in range(count)]
     for look in range(len(design.looks)):
-        studies = next_look(design, look, studies, times)
+        studies = next_look(design, look, studies, times, settled=False)
     by_pair = list(zip(*studies))
     return DecisionRates(
         n_studies=count,

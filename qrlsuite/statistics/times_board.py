@@ -1,8 +1,8 @@
 """All pairs of a board by their time below threshold: who outperforms whom, by how much, and which ranks remain.
 
 The verdicts by which boards rank; tiers by the paper's definition are in `qrlsuite.statistics.board`. The order is by
-mean time M. A pair is decided if Holm's procedure over all pairs of the board rejects its max-T permutation test
-(`MaxT`): for entries of equal laws the probability of any false decision on the whole board is alpha at most.
+mean time M. A pair is decided if Holm's procedure over all pairs of the board rejects its test by rule `steps`: for
+entries of equal laws the probability of any false decision on the whole board is alpha at most.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray, whole
-from qrlsuite.statistics.permutation import CHUNK, MaxT, relabelings_for
-from qrlsuite.statistics.times import MeanTime, check_probability, mean_time, student_quantile, times_below
+from qrlsuite.statistics.permutation import MaxT, with_half_epoch
+from qrlsuite.statistics.steps import holm_levels, ratio_interval, settle
+from qrlsuite.statistics.times import MeanTime, check_probability, mean_time, times_below
 
 FEW_RUNS = 50
 """Unequal numbers are marked where the smaller is below this: the test then errs more often than alpha says."""
-_CERTAIN = 2.5  # standard errors from its level, beyond which a p is not refined
 
 
 class Direction(StrEnum):
@@ -31,14 +31,13 @@ class Direction(StrEnum):
 
     FEWER = "needs fewer"
     MORE = "needs more"
-    TRADE_OFF = "trade-off"
     NOT_TOLD_APART = "not told apart"
     UNDECIDED = "undecided"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TimesBoard:
-    """The result of `times_board`, for M entries and E thresholds; matrices are from the row's side.
+    """The result of `times_board`, for M entries; matrices are from the row's side.
 
     Attributes
     ----------
@@ -51,20 +50,21 @@ class TimesBoard:
     means:
         M of each, see `MeanTime`; intervals at level 1 - alpha, each by itself.
     p:
-        Shape (M, M): max-T p of each pair by itself; NaN where undecided, and on the diagonal.
+        Shape (M, M): p of each pair by itself; NaN where undecided, and on the diagonal.
     adjusted:
         Shape (M, M): p adjusted for all pairs of the board (Holm 1979).
     directions:
         M rows of M: the decisions.
-    signs:
-        Shape (M, M, E): +1 where the row's entry needs significantly fewer steps at this threshold, at level
-        alpha / number of pairs; -1 where more.
     difference:
-        Shape (M, M): M of the row's entry over M of the column's, minus 1; NaN if the latter is 0.
+        Shape (M, M): M of the row's entry over M of the column's, minus 1, half an epoch's steps added to both.
     difference_interval:
-        Shape (M, M, 2): at level 1 - alpha for each pair by itself (Welch's t of the log ratio, delta method).
+        Shape (M, M, 2): at the level at which Holm's procedure tested the pair; NaN where undecided.
+    turns:
+        Shape (M, M): whether more than 10 million relabelings could turn the decision.
     ranks:
         Shape (M, 2): best and worst rank that the decisions leave; 0 for entries that stand apart.
+    failed, spreads:
+        Of each: its runs that reach no threshold, and standard deviation over mean of its runs.
     few:
         Shape (M, M): whether the numbers of runs are unequal and the smaller is below 50.
     """
@@ -77,10 +77,12 @@ class TimesBoard:
     p: FloatArray = field(repr=False)
     adjusted: FloatArray = field(repr=False)
     directions: tuple[tuple[Direction, ...], ...] = field(repr=False)
-    signs: IntArray = field(repr=False)
     difference: FloatArray = field(repr=False)
     difference_interval: FloatArray = field(repr=False)
+    turns: BoolArray = field(repr=False)
     ranks: IntArray = field(repr=False)
+    failed: tuple[int, ...]
+    spreads: tuple[float, ...]
     few: BoolArray = field(repr=False)
 
     @property
@@ -97,8 +99,7 @@ class TimesBoard:
     def outperforms(self) -> BoolArray:
         """Shape (M, M): whether the row's entry outperforms the column's.
 
-        The pair is decided, and it needs significantly fewer steps at a threshold and significantly more at none. The
-        rank of an entry is 1 + the number of entries that outperform it: the first column of `ranks`.
+        The rank of an entry is 1 + the number of entries that outperform it: the first column of `ranks`.
         """
         rows = [[each is Direction.FEWER for each in row] for row in self.directions]
         matrix: BoolArray = np.array(rows, dtype=bool).reshape(len(rows), -1)
@@ -121,8 +122,7 @@ def times_board(
     """Compare all pairs of M entries by their mean time below threshold.
 
     Entries with fewer than 20 runs stand apart, and so do incomplete ones: no pair with them is tested or counted.
-    Numbers of runs may differ. A decided pair has the direction of its largest |t|, unless thresholds of both signs are
-    significant at alpha / number of pairs: that is a trade-off.
+    Numbers of runs may differ. Relabelings go on until no decision can turn.
 
     Parameters
     ----------
@@ -157,25 +157,25 @@ def times_board(
     size = len(entries)
     ranked = [place for place, entry in enumerate(entries) if entry.n_runs >= MIN_RUNS and entry.complete]
     pairs = [(i, j) for place, i in enumerate(ranked) for j in ranked[place + 1 :]]
-    test = MaxT([(times[i], times[j]) for i, j in pairs], seed=seed)
-    refine(test, alpha)
+    epoch = max(entry.steps_per_epoch for entry in entries)
+    of_runs = [with_half_epoch(each, epoch).sum(axis=1) for each in times]
+    test = MaxT([(of_runs[i][:, None], of_runs[j][:, None]) for i, j in pairs], seed=seed, ratio=True)
+    turning = settle(test, alpha)
     p, adjusted = (np.full((size, size), np.nan) for _ in range(2))
-    signs = np.zeros((size, size, grid.shape[0]), dtype=np.int64)
+    turns = np.zeros((size, size), dtype=bool)
+    means = np.array([each.mean() for each in of_runs])
+    difference = means[:, None] / means - 1
+    interval = np.full((size, size, 2), np.nan)
     directions = [[Direction.UNDECIDED] * size for _ in range(size)]
-    corrected = holm(test.p)
+    corrected, levels = holm(test.p), holm_levels(test.p, alpha)
     for index, (i, j) in enumerate(pairs):
         p[i, j] = p[j, i] = test.p[index]
         adjusted[i, j] = adjusted[j, i] = corrected[index]
-        signs_by_threshold = np.where(
-            test.p_each[index] <= alpha / len(pairs), np.sign(test.t[index]), 0
-        ).astype(np.int64)
-        signs[i, j], signs[j, i] = signs_by_threshold, -signs_by_threshold
-        sign = direction(test.t[index], signs_by_threshold) if corrected[index] <= alpha else None
-        directions[i][j], directions[j][i] = (
-            named_direction(sign),
-            named_direction(None if sign is None else -sign),
-        )
-    difference, interval = _differences(times, 1 - alpha)
+        turns[i, j] = turns[j, i] = turning[index]
+        sign = int(np.sign(test.t[index, 0])) if corrected[index] <= alpha else 0
+        directions[i][j], directions[j][i] = named_direction(sign), named_direction(-sign)
+        _, low, high = ratio_interval(of_runs[i], of_runs[j], float(levels[index]), sign != 0, seed)
+        interval[i, j], interval[j, i] = (low, high), (1 / (1 + high) - 1, 1 / (1 + low) - 1)
     better = np.array([[each is Direction.FEWER for each in row] for row in directions], bool).reshape(
         size, -1
     )
@@ -189,10 +189,12 @@ def times_board(
         p=p,
         adjusted=adjusted,
         directions=tuple(tuple(row) for row in directions),
-        signs=signs,
         difference=difference,
         difference_interval=interval,
+        turns=turns,
         ranks=rank_ranges(better, [place in ranked for place in range(size)]),
+        failed=tuple(int((each == end).all(axis=1).sum()) for each in times),
+        spreads=tuple(spread(each) for each in of_runs),
         few=(counts[:, None] != counts) & (np.minimum.outer(counts, counts) < FEW_RUNS),
     )
 
@@ -212,50 +214,14 @@ def _common_end(entries: Sequence[LearningCurves], horizon: int | None) -> int:
     return first.horizon
 
 
-def refine(test: MaxT, alpha: float) -> None:
-    """Relabel until Holm's decisions over all pairs of a test are clear, or 20 / smallest level times.
-
-    Ten thousand relabelings for every pair; more for those whose p is within 2.5 standard errors of the level
-    that Holm's procedure compares it with, or whose sign at a threshold may make the pair a trade-off.
-    """
-    n_pairs = len(test.t)
-    if not n_pairs:
-        return
-    most = relabelings_for(alpha / n_pairs)
-    count, which = CHUNK, np.arange(n_pairs)
-    while len(which):
-        test.extend(count, which)
-        order = np.argsort(test.p, kind="stable")
-        levels = np.empty(n_pairs)
-        levels[order] = alpha / np.arange(n_pairs, 0, -1)
-        unclear = _near(test.reached.min(axis=1), test.n_relabelings, levels)
-        leading = np.sign(test.t[np.arange(n_pairs), test.reached.argmin(axis=1)])
-        against = np.sign(test.t) * leading[:, None] < 0
-        opposed = _near(test.reached, test.n_relabelings[:, None], np.full((n_pairs, 1), alpha / n_pairs))
-        unclear |= (against & opposed).any(axis=1)
-        which = np.flatnonzero(unclear & (test.n_relabelings < most))
-        count = min(2 * count, most)
+def spread(of_runs: IntArray) -> float:
+    """Return standard deviation over mean of positive numbers, (N,); NaN of a single one."""
+    return float(of_runs.std(ddof=1) / of_runs.mean()) if len(of_runs) > 1 else float("nan")
 
 
-def _near(reached: IntArray, count: IntArray, level: FloatArray) -> BoolArray:
-    """Return whether a level lies in the score interval of the share reached / count (Wilson 1927)."""
-    share = reached / count
-    near: BoolArray = np.abs(share - level) <= _CERTAIN * np.sqrt(level * (1 - level) / count)
-    return near
-
-
-def direction(t: FloatArray, signs: IntArray) -> int:
-    """Return 1 or -1, the sign of the largest |t| of (E,), or 0 if significant signs of (E,) are of both kinds."""
-    if (signs > 0).any() and (signs < 0).any():
-        return 0
-    return int(np.sign(t[np.abs(t).argmax()]))
-
-
-def named_direction(sign: int | None) -> Direction:
-    """Return the direction of a decided pair's sign, see `direction`; None is an undecided pair."""
-    if sign is None:
-        return Direction.NOT_TOLD_APART
-    return {1: Direction.FEWER, -1: Direction.MORE, 0: Direction.TRADE_OFF}[sign]
+def named_direction(sign: int) -> Direction:
+    """Return the direction of a pair: 1 needs fewer, -1 more, and 0 is not told apart."""
+    return {1: Direction.FEWER, -1: Direction.MORE, 0: Direction.NOT_TOLD_APART}[sign]
 
 
 def holm(p: ArrayLike) -> FloatArray:
@@ -312,10 +278,3 @@ def log_ratios(times: Sequence[IntArray]) -> tuple[FloatArray, FloatArray, Float
     undefined = (means == 0)[:, None] | (means == 0)
     ratio[undefined] = np.nan
     return ratio, np.sqrt(both), freedom
-
-
-def _differences(times: Sequence[IntArray], level: float) -> tuple[FloatArray, FloatArray]:
-    ratio, error, freedom = log_ratios(times)
-    reach = student_quantile((1 + level) / 2, freedom) * error
-    np.fill_diagonal(reach, 0)
-    return np.expm1(ratio), np.expm1(np.stack([ratio - reach, ratio + reach], axis=2))

@@ -88,7 +88,7 @@ class Study:
         self.folder = runs / FOLDER / file.name
         self.file, members = _fixed(file)
         if self.begun and (self.folder / FILE).is_file():
-            self.file = _with_code_of(self.file, load_kept(self.folder / FILE))
+            self.file = _as_begun(self.file, load_kept(self.folder / FILE))
         self.looks = self.file.looks or LooksSection()
         self.hash = digest(_content(self.file))
         self.epochs = self.looks.epochs or 0
@@ -532,8 +532,13 @@ def _has_other_code(table: EntriesSection, entry: Entry) -> bool:
     return not found and table.code not in (None, code_of(entry))
 
 
-def _with_code_of(file: StudyFile, kept: StudyFile) -> StudyFile:
-    """Return a study that has begun, with the code that its entries had then: with another one, training is refused."""
+def _as_begun(file: StudyFile, kept: StudyFile) -> StudyFile:
+    """Return a study that has begun, with its entries' code of then, without which training is refused.
+
+    A file that names no rule has the rule that was the default then.
+    """
+    if file.looks is not None and kept.looks is not None and "rule" not in file.looks.model_fields_set:
+        file = file.model_copy(update={"looks": file.looks.model_copy(update={"rule": kept.looks.rule})})
     codes = {table.hash: table.code for table in kept.entries}
     tables = [
         table.model_copy(update={"code": codes[table.hash]}) if table.hash in codes else table

@@ -112,7 +112,7 @@ class LooksSection(Table):
     epochs: Annotated[
         int | None, Field(ge=1, description="of every seed: the horizon at which entries are compared")
     ] = None
-    rule: Literal["times", "times-skewed"] = "times"
+    rule: Literal["steps", "times"] = "steps"
     epsilons: Annotated[
         list[float] | None,
         Field(min_length=1, description="thresholds 1 - epsilon on a score with maximum 1"),

@@ -518,7 +518,7 @@ alpha = 0.05 => alpha = 1.5 => widths.toml: alpha = 1.5 is outside (0, 1)
 first_seed = 10000 => first_seed = 10000\nfrist_seed = 1 => unknown key 'frist_seed'
 width = 8 => width = 5 => widths.toml: entries.1.hash is '
 width = 8 => width = "wide" => widths.toml, entries.1:
-rule = "times" => rule = "intervals" => rule
+rule = "steps" => rule = "intervals" => rule
     20,\n    40, =>     40,\n    20, => looks = [40, 20, 60, 80, 100]: each must be at more runs
 "wide", "narrow" => "wide", "narow" => pairs: 'narow' is not one of the entries
 "mlp width=8", "wide" => "narrow", "wide" => a pair is repeated
@@ -590,6 +590,7 @@ def test_pictures_have_a_row_for_each_pair_and_each_entry(refused: Refused) -> N
     assert [text.get_text() for text in legend.texts] == ["A needs fewer steps", "equal within the margin"]
     assert {text.get_text() for text in axes.texts} == {"20", "40"}
     assert "cut at" not in figure.get_supxlabel()
+    assert "open markers" not in figure.get_supxlabel()
     first, second = outcome.pairs
     unbounded = (
         replace(first, interval=(-1.0, math.inf)),
@@ -611,6 +612,15 @@ def test_pictures_have_a_row_for_each_pair_and_each_entry(refused: Refused) -> N
     for row, name in enumerate(names):
         assert lines[row].get_xdata() == pytest.approx(times[name].interval)
     assert [text.get_text() for text in axes.texts] == ["40", "40", "20"]
+    by_threshold = replace(
+        first, interval=(-0.1, 0.5), leading_difference=0.7, leading_interval=(0.2, 1.0)
+    )  # as `times` decides
+    decision = replace(outcome.decision, pairs=(by_threshold, second))
+    figure = drawing.draw(replace(outcome, decision=decision))
+    [axes] = figure.axes
+    drawn = next(list(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2)
+    assert drawn == pytest.approx([1.2, 2.0]), "no colored line across 0"
+    assert "open markers: at the threshold that decided" in figure.get_supxlabel()
 
 
 def test_a_study_keeps_the_values_and_the_record_of_a_preset_file() -> None:

@@ -86,7 +86,7 @@ def curves(first_good: int, name: str) -> LearningCurves:
 
 def test_built_in_rules_are_registered_like_anyones() -> None:
     known = registry.load()
-    assert set(known.names(specs.RuleSpec)) == {"intervals", "times", "times-skewed"}
+    assert set(known.names(specs.RuleSpec)) == {"intervals", "times", "steps"}
     for name in known.names(specs.RuleSpec):
         assert known.get(specs.RuleSpec, name).distribution == "qrlsuite"
         assert rules.load(name).name == name

@@ -141,9 +141,9 @@ def test_what_the_board_of_three_spins_says() -> None:
 
     sines, width = called("mlp width=5 activation=sin "), called("mlp width=5 input_scale")
     said = api.compare(LOAD(sines, "vqe-ising"), LOAD(width, "vqe-ising")).verdict
-    assert "needs 33% fewer steps" in said
-    assert "(27% to 38%, 50 seeds each" in said
-    assert "with sines it needs 33% fewer steps (27% to 38%)" in text
+    assert "needs 32% fewer steps" in said
+    assert "(26% to 37%, 50 seeds each" in said
+    assert "with sines it needs 32% fewer steps (26% to 37%)" in text
     for circuit in ("vqc-native model.qubits=4 init", "vqc-native model.qubits=4 layers=5 ansatz=jerbi init"):
         (record,) = (each for each in records("vqe-ising") if each["label"] == called(circuit))
         assert record["identity"]["algorithm_options"]["quantum_lr"] < 1e-4
@@ -179,16 +179,15 @@ def test_what_the_board_of_clifford_says() -> None:
         f"and tanh at {regrets['tanh'][0]}, after {regrets['tanh'][1]} runs alone."
     ) in text
     pairs = {row[1]: row[2] for row in load("tables").pairs("clifford")}
-    for asked, share in (("tanh", "37% more"), ("sines", "30% more"), ("width 6", "4% fewer")):
+    for asked, share in (("tanh", "36% more"), ("sines", "29% more"), ("width 6", "4% fewer")):
         assert share in pairs[f"`iqp` against {asked}"]
-    assert "It needs 37% and 30% more steps." in text
-    assert "behind the circuit, by 4 percent." in text
+    assert "It needs 36% and 29% more steps." in text
 
 
 @pytest.mark.parametrize(
     ("task", "title", "shares"),
     [
-        ("cartpole", "CartPole with PPO", {"width 8": "31% fewer", "its mean-field control": "27% more"}),
+        ("cartpole", "CartPole with PPO", {"width 8": "30% fewer", "its mean-field control": "26% more"}),
         ("channel", "Error channels", {"tanh": "17% more", "sines": "18% more"}),
     ],
 )
@@ -209,10 +208,12 @@ def test_what_the_boards_with_ppo_say(task: str, title: str, shares: dict[str, s
         if p is not None and p <= 0.05 and one < other
     }
     if task == "cartpole":
-        ahead = {"tanh", "sines", "iqp", "iqp mean-field", "iqp separable"}
+        ahead = {"sines", "iqp mean-field", "iqp separable"}
         assert {one for one, other in better if other == "width 8"} >= ahead
-        assert ("iqp mean-field", "iqp") in better
         assert not better & {
+            ("iqp", "width 8"),
+            ("tanh", "width 8"),
+            ("iqp mean-field", "iqp"),
             ("iqp separable", "iqp"),
             ("iqp", "iqp separable"),
             ("tanh", "iqp"),

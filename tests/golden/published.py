@@ -42,7 +42,7 @@ TOLERANCE = 1e-9
 
 AXES = ("steps", "executions", "shots", "core-hours", "energy-error")
 AXES_OF_SCORES = ("score", "area")
-RULES = ("paper", "times", "times-skewed")
+RULES = ("paper", "times", "steps")
 DEGREES = ("beam6g", "beam6g-degree4", "beam6g-degree5", "beam6g-degree6")
 TOGETHER = (
     "quantum-or-not-degree5 quantum-or-not-a3-0",

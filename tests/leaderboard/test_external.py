@@ -76,7 +76,7 @@ def test_unequal_steps_take_the_last_score_at_or_before_each_grid_point(tmp_path
     curve = a.store.seed(0).read().curve
     # at 10, 20, 30, 40: not the 9 before training, and nothing after 40
     assert curve.tolist() == [1, 2, 2, 3]
-    assert a.notes == ("'a' has 1 seed: a verdict needs 20 of each entry",)
+    assert a.notes == ("'a' has 1 seed: a verdict needs 4 of each entry, a rank on a board 20",)
 
 
 def test_a_grid_is_round_where_every_run_has_begun(tmp_path: Path) -> None:
@@ -577,7 +577,7 @@ def test_names_of_one_s_own_are_shown_as_they_are(
     assert [name in table for name in ("Ours, lr=0.1", "external baseline", "slow lr")] == [True, True, False]
     qrlsuite("compare", "fast", "slow", *own, "--out", "verdict.tex")
     verdict = (tmp_path / "verdict.tex").read_text()
-    assert r"\caption{Ours, lr=0.1 needs 57\% fewer steps than external baseline (" in verdict
+    assert r"\caption{Ours, lr=0.1 needs 53\% fewer steps than external baseline (" in verdict
     qrlsuite("leaderboard", *own, "--out", "board.tex")
     assert r"& Ours, lr=0.1 & $" not in (board := (tmp_path / "board.tex").read_text())
     assert "1 & Ours, lr=0.1 & " in board

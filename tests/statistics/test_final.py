@@ -94,15 +94,17 @@ def test_a_pair_is_judged_as_by_a_board_of_two() -> None:
         pair, board = times_pair(first, second, grid), times_board([first, second], grid)
         assert pair.direction is board.directions[0][1] is expected
         assert pair.p == board.p[0, 1]
-        assert pair.signs.tolist() == board.signs[0, 1].tolist()
         assert pair.difference[0] == pytest.approx(board.difference[0, 1])
         assert pair.difference[1:] == pytest.approx(board.difference_interval[0, 1])
         assert pair.at_cap.tolist() == [[0, 0, 1], [0, 0, 1]]
         assert pair.differences[2].tolist() == [0, 0, 0]
+        assert (pair.failed, board.failed) == ((0, 0), (0, 0))
+        assert pair.spreads == board.spreads
 
 
 def test_each_threshold_has_its_own_difference() -> None:
     pair = times_pair(curves(np.full(20, 10), "a"), curves(np.full(20, 20), "b"), Grid.relative([0.2], [0.5]))
     assert pair.means.tolist() == [[10_000], [20_000]]
-    assert pair.differences == pytest.approx(np.full((1, 3), -0.5))
+    assert pair.differences == pytest.approx(np.full((1, 3), 10.5 / 20.5 - 1))
+    assert pair.difference == pytest.approx(np.full(3, 10.5 / 20.5 - 1))
     assert pair.p_each[0] < 1e-3

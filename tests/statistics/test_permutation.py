@@ -15,12 +15,12 @@ from qrlsuite.statistics import (
     LearningCurves,
     MaxT,
     Resampling,
-    SkewedTimesRule,
     SmoothedRuns,
+    StepsRule,
     TimesRule,
     compare,
 )
-from qrlsuite.statistics.permutation import CHUNK, relabelings, relabelings_for, skewed_t, smallest, welch_t
+from qrlsuite.statistics.permutation import CHUNK, ratio_t, relabelings, relabelings_for, smallest, welch_t
 from tests.statistics.conftest import SURFACE, entry
 
 
@@ -168,7 +168,7 @@ def test_all_deltas_of_a_tolerance_have_its_sign() -> None:
     assert (signs > 0).all()
 
 
-@pytest.mark.parametrize("rule", [TimesRule, SkewedTimesRule])
+@pytest.mark.parametrize("rule", [TimesRule, StepsRule])
 def test_alpha_and_seed_decide(rule: type) -> None:
     with pytest.raises(OptionError, match="alpha"):
         rule(0)
@@ -187,9 +187,7 @@ def test_alpha_and_seed_decide(rule: type) -> None:
     assert (rule()(*seeded[0]) == rule()(*seeded[1])).all()
 
 
-@pytest.mark.parametrize(
-    ("rule", "index"), [(TimesRule(), 0), (SkewedTimesRule(), 1)], ids=["times", "times-skewed"]
-)
+@pytest.mark.parametrize(("rule", "index"), [(TimesRule(), 0), (StepsRule(), 1)], ids=["times", "steps"])
 def test_equal_entries_rarely_differ_and_slow_ones_are_found(rule: TimesRule, index: int) -> None:
     model = SmoothedRuns(entry(index))
     rates = power(model, model, 30, 30, SURFACE, rule, n_pairs=60)
@@ -206,53 +204,64 @@ def test_a_grid_of_one_cell() -> None:
     assert TimesRule()(*pair).tolist() == [[1]]
 
 
-def test_the_correction_for_skewness_by_hand() -> None:
-    """First: mean 0, variance 0, third 0. Second: 0, 0, 3 have mean 1, variance of the mean 1, third cumulant 2 / 9."""
-    first, second = np.array([[0], [0], [0]]), np.array([[0], [0], [3]])
-    # mean cube of the deviations -1, -1, 2 is 2; over n^2 = 9, and variance 3 / 3 = 1; t = 1
-    skewness = 2 / 9
-    expected = 1 + skewness * 3 / 6 + skewness**2 / 27
-    assert skewed_t(first, second) == pytest.approx([expected])
-    assert skewed_t(second, first) == pytest.approx([-expected])
+def test_the_log_ratio_over_its_error_by_hand() -> None:
+    """Means 2 and 4, variances of the means 1 / 2 each: relative ones of 1 / 8 and 1 / 32 add up."""
+    first, second = column(1, 3) * 6, column(3, 5) * 6
+    # (1, 3): variance 2 over 2 runs is 1, over 2^2 is 1 / 4; (3, 5): 1 over 4^2 is 1 / 16
+    expected = np.log(2) / np.sqrt(1 / 4 + 1 / 16)
+    assert ratio_t(first, second) == pytest.approx([expected])
+    assert ratio_t(second, first) == pytest.approx([-expected])
+    assert ratio_t(column(5, 5), column(5, 5)).tolist() == [0]
+    assert ratio_t(column(5, 5), column(9, 9)).tolist() == [np.inf]
 
 
-def test_the_corrected_t_is_counted_over_all_relabelings() -> None:
+@pytest.mark.parametrize("sizes", [(4, 4), (3, 5), (5, 3)])
+def test_few_labelings_of_a_ratio_are_all_counted(sizes: tuple[int, int]) -> None:
     generator = np.random.default_rng(0)
-    for sizes in ((4, 4), (3, 5)):
-        first, second = (generator.integers(0, 9, (size, 2)) ** 2 for size in sizes)
-        test = MaxT([(first, second)], skewed=True)
-        test.extend(50_000)
-        pooled = np.concatenate([first, second])
-        maxima = []
-        for chosen in combinations(range(8), sizes[0]):
-            mask = np.isin(np.arange(8), chosen)
-            maxima.append(np.abs(skewed_t(pooled[mask], pooled[~mask])).max())
-        exact = [np.mean(np.array(maxima) >= abs(t) * (1 - 1e-9)) for t in skewed_t(first, second)]
-        assert test.p_each[0] == pytest.approx(exact, abs=0.01)
+    first, second = (generator.integers(1, 9, (size, 2)) ** 2 for size in sizes)
+    test = relabeled(first, second, ratio=True)
+    pooled, maxima = np.concatenate([first, second]), []
+    for chosen in combinations(range(8), sizes[0]):
+        mask = np.isin(np.arange(8), chosen)
+        maxima.append(np.abs(ratio_t(pooled[mask], pooled[~mask])).max())
+    exact = [np.mean(np.array(maxima) >= abs(t) * (1 - 1e-9)) for t in ratio_t(first, second)]
+    assert test.n_relabelings.tolist() == [len(maxima)]
+    assert test.p_each[0].tolist() == exact
+    assert not test.turns(np.full(1, exact[0]), 1e-3).any(), "all labelings leave no error"
+    critical = test.critical(exact[0])[0]
+    assert [abs(t) > critical for t in test.t[0]] == [p <= exact[0] for p in exact]
 
 
-def test_the_corrected_t_survives_what_does_not_vary_and_has_a_swapped_pair_s_p() -> None:
-    same, other = np.full((20, 1), 2000), np.full((20, 1), 4000)
-    assert skewed_t(same, same).tolist() == [0]
-    assert skewed_t(same, other).tolist() == [np.inf]
+def test_shuffled_labelings_of_a_ratio_count_as_fresh_ones() -> None:
+    """Chunks after the first shuffle the runs: together, and pair by pair, they count what fresh labels count."""
     generator = np.random.default_rng(1)
-    pair = generator.integers(0, 50, (25, 3)) * 2000, generator.integers(5, 60, (25, 3)) * 2000
-    tests = [MaxT([each], skewed=True) for each in (pair, pair[::-1], (same, other))]
-    for test in tests:
-        test.extend(10_000)
-    assert tests[0].p == tests[1].p
-    assert tests[2].p[0] < 1e-3
+    pairs = [(generator.integers(20, 70, (25, 1)), generator.integers(25, 75, (n, 1))) for n in (25, 25, 40)]
+    together, fresh = MaxT(pairs, ratio=True), []
+    together.extend(10 * CHUNK)
+    for index, (first, second) in enumerate(pairs):
+        alone = relabeled(first, second, ratio=True)
+        alone.extend(10 * CHUNK)
+        assert alone.reached[0, 0] == together.reached[index, 0]
+        pooled = np.concatenate([first, second])[:, 0]
+        orders = generator.permuted(np.tile(pooled, (50_000, 1)), axis=1)
+        sides = orders[:, : len(first)].T, orders[:, len(first) :].T
+        fresh.append(np.mean(np.abs(ratio_t(*sides)) >= abs(together.t[index, 0]) * (1 - 1e-9)))
+    assert together.p == pytest.approx(fresh, abs=0.01)
+    swapped = relabeled(*pairs[2][::-1], ratio=True)
+    assert swapped.t[0, 0] == -together.t[2, 0]
+    swapped.extend(10 * CHUNK)
+    assert swapped.p[0] == together.p[2]
 
 
-def test_the_skewed_rule_errs_less_where_runs_of_one_entry_fail() -> None:
-    """15 percent of one entry's runs fail, all of the other's are later, at equal means: 300 pairs of 20 runs."""
+def test_whether_more_relabelings_can_turn_a_decision() -> None:
+    """Robbins by hand: 10,000 relabelings of which 100 reach leave .01 open, and neither .005 nor .02."""
     generator = np.random.default_rng(2)
-    ours = generator.integers(20, 41, (300, 20, 1))
-    ours[generator.random((300, 20)) < 0.15] = 100
-    theirs = generator.integers(20, 41, (300, 20, 1)) * 1000 + 70 * 150
-    plain, skewed = (MaxT(list(zip(ours * 1000, theirs)), skewed=kind) for kind in (False, True))
-    rates = []
-    for test in (plain, skewed):
-        test.extend(10_000)
-        rates.append(float((test.p <= 0.05).mean()))
-    assert rates[0] > 0.07 > rates[1]
+    test = relabeled(*(generator.integers(1, 50, (20, 1)) for _ in range(2)), ratio=True)
+    test.reached[:] = 100
+    assert [bool(test.turns(np.full(1, level), 1e-3)[0]) for level in (0.005, 0.0085, 0.01, 0.012, 0.02)] == [
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]

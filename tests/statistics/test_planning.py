@@ -17,7 +17,7 @@ from qrlsuite.statistics import (
     LearningCurves,
     SequentialDesign,
     SmoothedRuns,
-    TimesRule,
+    StepsRule,
     decision_rates,
     planning,
     runs_needed,
@@ -25,20 +25,29 @@ from qrlsuite.statistics import (
     slower,
     times_below,
 )
+from qrlsuite.statistics.permutation import with_half_epoch
 from qrlsuite.statistics.sequential import Decision, PairDecision
-from qrlsuite.statistics.simulation import judge_times
+from qrlsuite.statistics.simulation import judge_steps
 from tests.statistics.conftest import SURFACE, entry
 
 PILOT = SmoothedRuns(entry(0))
 
 
-def test_times_judged_together_are_judged_as_by_the_rule() -> None:
+def test_steps_judged_together_are_judged_as_by_the_rule() -> None:
     pairs = list(simulated_pairs(PILOT, SmoothedRuns(slower(entry(0), 1.2)), 20, 20, 30))
     ours, theirs = (
-        np.stack([times_below(pair[side].values, SURFACE, 2000) for pair in pairs]) for side in (0, 1)
+        np.stack(
+            [
+                with_half_epoch(times_below(pair[side].values, SURFACE, 2000), 2000).sum(
+                    axis=1, keepdims=True
+                )
+                for pair in pairs
+            ]
+        )
+        for side in (0, 1)
     )
-    together = judge_times(ours, theirs)
-    [alone] = judge(pairs, SURFACE, [TimesRule()])
+    together = judge_steps(ours, theirs)
+    [alone] = judge(pairs, SURFACE, [StepsRule()])
     assert 0 < together.first < 1
     assert (together.first, together.second) == (alone.first_wins, alone.second_wins)
     assert together.found == pytest.approx(alone.any_cell)

@@ -182,6 +182,23 @@ def test_a_decision_relabels_within_the_blocks_of_its_looks() -> None:
         assert test.p[0] == expected
 
 
+def test_a_look_by_rule_steps_relabels_one_number_until_nothing_can_turn() -> None:
+    """Within blocks, of the mean over thresholds with half an epoch; its interval leaves out 0 with its p."""
+    model, generator = SmoothedRuns(entry(0)), np.random.default_rng(8)
+    runs = {name: model.draw(40, generator) for name in "ab"}
+    slow = {**runs, "b": SmoothedRuns(entry(1)).draw(40, generator)}
+    pairs = [decide(design(rule="steps"), each, SURFACE).pairs[0] for each in (runs, slow)]
+    times = [times_below(runs[name].values, SURFACE, 2000) for name in "ab"]
+    for look, p in enumerate(pairs[0].p):
+        numbers = [(2 * each[: LOOKS[look]] + 2000).sum(axis=1, keepdims=True) for each in times]
+        test = MaxT([tuple(numbers)], ((20, 20),) * (look + 1), ratio=True)  # type: ignore[list-item]
+        test.extend(CHUNK)
+        assert test.p[0] == p
+    assert [pair.differs for pair in pairs] == [False, True]
+    for pair in pairs:
+        assert (pair.interval[0] < 0 < pair.interval[1]) != pair.differs
+
+
 def test_sentences_of_all_kinds() -> None:
     pair = PairDecision("x", "y", n_runs=100, interval=(-0.04, 0.12))
     verdicts = {

@@ -20,7 +20,8 @@ from qrlsuite.statistics import (
     times_board,
 )
 from qrlsuite.statistics.permutation import CHUNK
-from qrlsuite.statistics.times_board import direction, log_ratios, refine
+from qrlsuite.statistics.steps import holm_levels, settle
+from qrlsuite.statistics.times_board import log_ratios
 from tests.statistics.conftest import SURFACE, entry
 
 CELL = Grid.relative([0.1, 0.5], [0.5])
@@ -59,12 +60,11 @@ def test_a_board_by_hand() -> None:
     assert board.directions[1] == (Direction.FEWER, Direction.UNDECIDED, Direction.FEWER)
     assert board.directions[0] == (Direction.UNDECIDED, Direction.MORE, Direction.NOT_TOLD_APART)
     assert board.ranks.tolist() == [[2, 3], [1, 1], [2, 3]]
-    assert board.difference[1].tolist() == pytest.approx([-0.5, 0, -0.5])
-    assert board.difference_interval[0, 1].tolist() == pytest.approx([1, 1]), "400 is 100 percent over 200"
+    assert board.difference[1].tolist() == pytest.approx([-4 / 9, 0, -4 / 9]), "250 to 450 with half an epoch"
+    assert board.difference_interval[0, 1].tolist() == pytest.approx([0.8, 0.8]), "450 is 80 percent over 250"
     assert board.p[0, 2] == board.adjusted[0, 2] == 1
     assert board.p[0, 1] == pytest.approx(1e-4, abs=1e-4)
     assert np.isnan(board.p.diagonal()).all()
-    assert board.signs[1, 0].tolist() == [1, 1]
     assert board.outperforms.tolist() == [[False] * 3, [True, False, True], [False] * 3]
     assert board.order_at_half == board.order
     assert not board.few.any()
@@ -79,17 +79,25 @@ def test_the_difference_and_its_interval_by_hand() -> None:
     assert freedom[1, 0] == pytest.approx((1 / 4 + 1 / 16) ** 2 / (1 / 16 + 1 / 256))
 
 
-def test_thresholds_of_both_signs_are_a_trade_off() -> None:
-    """The first is half good early and never fully; the second is fully good late."""
-    half, late = np.zeros((40, 10)), np.zeros((40, 10))
-    half[:, 2:], late[:, 6:] = 0.6, 1
-    noise = np.random.default_rng(0).integers(0, 2, 40)
-    half[noise == 1, 2] = 0
-    board = times_board([LearningCurves(half, 1, "half"), LearningCurves(late, 1, "late")], CELL)
-    assert board.signs[0, 1].tolist() == [-1, 1]
-    assert board.directions[0][1] is board.directions[1][0] is Direction.TRADE_OFF
-    assert board.ranks.tolist() == [[1, 2], [1, 2]]
-    assert direction(np.array([-2.0, 3.0]), np.array([0, 0])) == 1
+def test_each_p_is_tested_at_the_level_of_its_step() -> None:
+    """Of four, .001 meets alpha / 4 and .012 alpha / 3; .03 misses alpha / 2, where the procedure ends."""
+    assert holm_levels(np.array([0.03, 0.001, 0.5, 0.012]), 0.05).tolist() == [0.025, 0.0125, 0.025, 0.05 / 3]
+    assert holm_levels(np.array([0.01, 0.02]), 0.05).tolist() == [0.025, 0.05], "all are rejected"
+    assert holm_levels(np.array([]), 0.05).size == 0
+
+
+def test_intervals_of_a_board_leave_out_zero_where_a_pair_is_decided() -> None:
+    generator = np.random.default_rng(3)
+    starts = [generator.integers(low, low + 12, 30) for low in (2, 4, 5, 9)]
+    board = times_board([learner(str(k), *each, epochs=30) for k, each in enumerate(starts)], CELL)
+    directions = [board.directions[i][j] for i in range(4) for j in range(i)]
+    assert {*directions} == {Direction.MORE, Direction.NOT_TOLD_APART}
+    for i in range(4):
+        for j in range(i):
+            low, high = board.difference_interval[i, j]
+            assert (low > 0) == (board.directions[i][j] is Direction.MORE)
+            assert low < board.difference[i, j] < high
+            assert 1 / (1 + board.difference_interval[j, i]) - 1 == pytest.approx([high, low])
 
 
 def test_degenerate_boards() -> None:
@@ -99,7 +107,9 @@ def test_degenerate_boards() -> None:
     assert capped.difference[0, 1] == 0
     at_once = times_board([learner("a", 0), learner("b", 4)], CELL)
     assert at_once.directions[0][1] is Direction.FEWER
-    assert np.isnan(at_once.difference[1, 0]), "nothing is so many percent more than no steps at all"
+    assert at_once.difference[1, 0] == pytest.approx(8), (
+        "450 over the half epoch of one that is there at once"
+    )
     alone = times_board([learner("a", 3)], CELL)
     assert alone.ranks.tolist() == [[1, 1]]
     few = times_board([learner("a", 3), learner("b", 8), learner("few", 1, n_runs=19)], CELL)
@@ -129,16 +139,19 @@ def test_bad_boards_are_named() -> None:
 
 def test_only_pairs_near_their_level_are_relabeled_further() -> None:
     generator = np.random.default_rng(0)
-    base = generator.integers(0, 50, (20, 30, 1))
-    pairs = [(each, generator.integers(0, 50, (30, 1))) for each in base[:18]]
-    pairs += [(base[18], base[18] + 100), (base[19], generator.integers(14, 64, (30, 1)))]
-    test = MaxT(pairs)
-    refine(test, 0.05)
+    base = generator.integers(50, 100, (20, 30, 1))
+    pairs = [(each, generator.integers(50, 100, (30, 1))) for each in base[:18]]
+    pairs += [(base[18], base[18] + 100), (base[19], generator.integers(60, 114, (30, 1)))]
+    test = MaxT(pairs, ratio=True)
+    assert not settle(test, 0.05).any()
     assert (test.n_relabelings[:18] == CHUNK).all()
-    assert test.n_relabelings.max() <= 20 * 20 / 0.05 + CHUNK
-    again = MaxT(pairs)
-    refine(again, 0.05)
+    assert CHUNK < test.n_relabelings.max() < 10_000_000
+    again = MaxT(pairs, ratio=True)
+    settle(again, 0.05)
     assert (test.reached == again.reached).all()
+    stopped = MaxT(pairs, ratio=True)
+    settle(stopped, 0.05, seconds=0)
+    assert (stopped.n_relabelings == CHUNK).all()
 
 
 def test_equals_are_rarely_told_apart_and_seeds_decide() -> None:
