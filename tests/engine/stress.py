@@ -79,7 +79,7 @@ def disturbed(
                     killed["supervisor" if victim == run.pid else "worker"] += 1
         if run.poll() is None:
             run.send_signal(signal.SIGTERM)  # its workers save and end with it
-        run.wait()
+        assert run.wait() != 2 or killed["worker"], "the command was refused"
     return killed
 
 

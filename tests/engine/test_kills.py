@@ -35,7 +35,7 @@ reference = { threshold = -1000, delta = 0.5 }
 horizons = [1200]
 """
 )
-DRQN = "drqn gru width=8 warm_up=20 burn_in=2 length=4 batch=4"
+DRQN = "drqn gru width=8 burn_in=2 length=4 batch=4"
 TD3 = "td3 mlp width=8 warm_up=100 batch=16"
 
 
