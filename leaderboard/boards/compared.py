@@ -149,8 +149,6 @@ def compare_entries(
     for entry in (first, second):
         if entry.study:
             raise QrlSuiteError(f"'{entry.label}' was {WITH_LOOKS}")
-        if entry.chosen_seeds:
-            raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")
     if (first.folder, first.name, first.seeds) == (second.folder, second.name, second.seeds):
         raise QrlSuiteError(f"'{first.label}' is compared with itself: name another entry")
     epochs = min(first.curves.shape[1], second.curves.shape[1])

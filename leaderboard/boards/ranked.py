@@ -61,7 +61,7 @@ WITH_LOOKS = (
 def of_one_definition(
     entries: Sequence[EntryResults], definitions: Mapping[str, str] | None = None
 ) -> tuple[list[EntryResults], list[str]]:
-    """Leave out entries of studies with looks, with chosen seeds, or of another task or world than most entries.
+    """Leave out entries of studies with looks, or of another task or world than most entries.
 
     Another task is another definition of the task. Another world is other code of a plugin's environment. If equally
     many entries have two definitions, the one whose hash comes first stays.
@@ -77,8 +77,7 @@ def of_one_definition(
         The entries that stay, task by task, and one line for each entry that was left out.
     """
     problems = [f"{entry.folder}: {WITH_LOOKS}" for entry in entries if entry.study]
-    problems += [f"{entry.folder}: {entry.chosen_seeds}" for entry in entries if entry.chosen_seeds]
-    fixed = [entry for entry in entries if not entry.study and not entry.chosen_seeds]
+    fixed = [entry for entry in entries if not entry.study]
     kept = []
     for task in sorted({entry.task for entry in fixed}):
         members = [entry for entry in fixed if entry.task == task]

@@ -60,10 +60,8 @@ class EntryResults(Shown):
         Text behind its name where another code has the name alone.
     refused:
         One line for each seed that does not count, since a file is damaged or the folder is not that seed's.
-    chosen_seeds:
-        Why no board ranks it, if its seeds may have been chosen for publication; empty otherwise.
     asked:
-        The epochs to which seeds were asked for, by seed; empty where nobody recorded it.
+        The epochs to which seeds were asked for, by seed (of N published ones 0 to N - 1); empty without a record.
     withdrawn:
         Why seeds that were asked for no longer are, by seed.
     own_label:
@@ -80,7 +78,6 @@ class EntryResults(Shown):
     most: int | None = None
     mark: str = ""
     refused: tuple[str, ...] = ()
-    chosen_seeds: str = ""
     asked: Mapping[int, int] = field(default_factory=dict)
     withdrawn: Mapping[int, str] = field(default_factory=dict)
     own_label: str = ""
@@ -117,7 +114,6 @@ class EntryResults(Shown):
             epochs=length if most is None else min(length, most),
             most=most,
             refused=tuple(sorted({*self.refused, *other.refused})),
-            chosen_seeds=max(self.chosen_seeds, other.chosen_seeds),
             asked={**self.asked, **other.asked},
             withdrawn={s: why for s, why in {**self.withdrawn, **other.withdrawn}.items() if s not in seeds},
         )

@@ -139,17 +139,6 @@ class PublishedEntry:
         }
 
     @property
-    def chosen_seeds(self) -> str:
-        """Why no board ranks an entry whose seeds may have been chosen; empty where they are 0 to N - 1.
-
-        A study with looks has a block of its own, and takes no seeds beside it.
-        """
-        if self.record.plan is not None or self.seeds == tuple(range(len(self.seeds))):
-            return ""
-        missing = next(seed for seed, held in enumerate(self.seeds) if seed != held)
-        return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
-
-    @property
     def withdrawn(self) -> dict[int, str]:
         """Why seeds that were asked for no longer are, by seed."""
         return {int(seed): reason for seed, reason in self.published.withdrawn.items()}
@@ -157,7 +146,10 @@ class PublishedEntry:
     def entry_results(self) -> EntryResults:
         """Return the entry as a leaderboard ranks it."""
         runs = {seed: self.run(row) for row, seed in enumerate(self.seeds)}
-        facts = {"chosen_seeds": self.chosen_seeds, "withdrawn": self.withdrawn}
+        asked = dict[int, int]()
+        if self.record.plan is None:  # a study has a block of its own; other seeds may have been chosen
+            asked = dict.fromkeys(set(range(len(self.seeds))) - self.withdrawn.keys(), self.published.epochs)
+        facts = {"asked": asked, "withdrawn": self.withdrawn}
         return EntryResults.of(self.record, self.folder, runs, **facts)
 
     def run(self, row: int) -> SeedRun:

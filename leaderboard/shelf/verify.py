@@ -167,12 +167,12 @@ def verify(
         made_by = entry.record.entry(str(folder / "entry.json")) if rerun and repeatable else None
     except QrlSuiteError as error:
         return VerificationResult(folder, name, False, "files", (), str(error))
-    count, length = entry.curves.shape
+    (count, length), missing = entry.curves.shape, entry.entry_results().missing_text
     if made_by is None:
         agents = f", {len(entry.agents)} agents" if entry.agents else ""
         sound = f"files sound: {count} seeds of {length} epochs{agents}, hashes and label computed again"
         again = "no seed was trained again" if repeatable else "not repeatable here: a script trained it"
-        message = "; ".join(filter(None, [sound, entry.chosen_seeds, again]))
+        message = "; ".join(filter(None, [sound, missing, again]))
         return VerificationResult(folder, name, True, "files", (), message, digest)
     if changed := _changed_code(entry, made_by):
         return VerificationResult(folder, name, False, "files", (), changed, digest)
@@ -182,7 +182,7 @@ def verify(
     ok, check, message = _train_again(entry, made_by, places, report)
     if check == "verified" and choice is not None:
         check, message = "repeated", f"{message}; the draw of an earlier check, which proves nothing anew"
-    message = "; ".join(filter(None, [message, entry.chosen_seeds]))
+    message = "; ".join(filter(None, [message, missing]))
     seeds = tuple(entry.seeds[place] for place in places)
     return VerificationResult(folder, name, ok, check, seeds, message, digest, number)
 

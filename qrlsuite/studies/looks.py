@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import datetime
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,15 +160,10 @@ class Study:
             for table, (name, entry) in zip(self.file.entries, self.entries.items()):
                 if _has_other_code(table, entry):
                     raise OptionError(f"{self.source}: {self._other_code(name)}")
-            for name, seeds, path in self.trained_before():
+            for line in self.seen_before():
                 raise OptionError(
-                    f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a study "
-                    f"with looks needs seeds that nobody has seen; with first_seed = {self._next_block()} it has others"
-                )
-            for other, path in self.seen_before():
-                raise OptionError(
-                    f"{self.source}: study {other} has seen these seeds ({path}), and what they showed may have chosen "
-                    f"this one; with first_seed = {self._next_block()} it has others"
+                    f"{self.source}: {line}: a study with looks needs seeds that nobody has seen; with first_seed = "
+                    f"{self._next_block()} it has others"
                 )
             return False
         before, after = _content(load_kept(self.folder / FILE)), _content(self.file)
@@ -184,42 +179,32 @@ class Study:
             )
         return True
 
-    def trained_before(self) -> list[tuple[str, list[int], Path]]:
-        """Return seeds of the block that were trained elsewhere below the results folder: entry, seeds, folder."""
-        others = [self.runs, self.runs / TUNING]
-        studies = self.runs / FOLDER
-        if studies.is_dir():
-            others += sorted(path for path in studies.iterdir() if path.is_dir() and path != self.folder)
-        trained = []
-        for name, entry in self.entries.items():
-            for other in others:
-                path = other / entry.task.name / entry.name
-                if path.is_dir():
-                    seeds = [seed for seed in EntryStore(path).seeds() if seed in self.looks.block]
-                    trained += [(name, seeds, path)] if seeds else []
-        return trained
+    def seen_before(self) -> Iterator[str]:
+        """Yield a line for each entry with seeds of the block elsewhere, and for each other study that began with them.
 
-    def seen_before(self) -> list[tuple[str, Path]]:
-        """Return other studies that began with seeds of the block and an entry of this one: hash, and log.
-
-        A log that does not say with which seeds a study began may mean these.
+        A log that does not say with which seeds a study of these entries began may mean these.
         """
-        found, own = list[tuple[str, Path]](), self.looks.block
-        for path in sorted((self.runs / FOLDER).glob(f"*/{LOG}")):
-            file, lines = path.with_name(FILE), read_records(path, LookLine)
-            blocks = {line.plan: range(*line.seeds) for line in lines if line.seeds}
-            kept = load_kept(file) if file.is_file() else None
-            if kept is not None and kept.looks is not None:
-                blocks.setdefault(digest(_content(kept)), kept.looks.block)
-            theirs = [] if kept is None else kept.entries
-            shared = {table.hash for table in self.file.entries} & {table.hash for table in theirs}
-            for hash_ in dict.fromkeys(line.plan for line in lines if line.plan not in (None, self.hash)):
-                block = blocks.get(hash_, own)
-                if (shared or path.parent == self.folder) and max(block[0], own[0]) <= min(
-                    block[-1], own[-1]
+        own, studies = self.looks.block, sorted((self.runs / FOLDER).glob("*"))
+        for folder in (self.runs, self.runs / TUNING, *(path for path in studies if path != self.folder)):
+            for name, entry in self.entries.items():
+                path = folder / entry.task.name / entry.name
+                if (
+                    seeds := [seed for seed in EntryStore(path).seeds() if seed in own]
+                    if path.is_dir()
+                    else []
                 ):
-                    found.append((str(hash_), path))
-        return found
+                    yield f"seeds {format_seeds(seeds)} of '{name}' were trained already ({path})"
+        for log in (path / LOG for path in studies if (path / LOG).is_file()):
+            file, lines = log.with_name(FILE), read_records(log, LookLine)
+            blocks = {line.plan: range(*line.seeds) for line in lines if line.seeds}
+            kept = load_kept(file) if file.is_file() else self.file.model_copy(update={"entries": []})
+            if kept.looks is not None:
+                blocks.setdefault(digest(_content(kept)), kept.looks.block)
+            shared = {table.hash for table in self.file.entries} & {table.hash for table in kept.entries}
+            for plan in dict.fromkeys(line.plan for line in lines if line.plan not in (None, self.hash)):
+                block = blocks.get(plan, own)
+                if (shared or log.parent == self.folder) and max(block[0], own[0]) <= min(block[-1], own[-1]):
+                    yield f"study {plan} has seen these seeds ({log}), and what they showed may have chosen this one"
 
     def _next_block(self) -> int:
         return self.looks.first_seed + max(1000, len(self.looks.block))
@@ -420,7 +405,7 @@ def new(
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(files.problems(error, StudyFile))) from None
     study = Study(file.of("the study"), runs)
-    while first_seed is None and (study.trained_before() or study.seen_before()):
+    while first_seed is None and any(study.seen_before()):
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = Study(study.file.model_copy(update={"looks": moved}).of("the study"), runs)
     names, shared = list(study.entries), list[str]()

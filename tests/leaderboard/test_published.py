@@ -28,7 +28,6 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard.boards import board, costs
-from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect, import_seeds, published, verify
 from qrlsuite.leaderboard.shelf.curves import edited_between
 from qrlsuite.leaderboard.shelf.export import export
@@ -452,13 +451,10 @@ def test_seeds_that_may_have_been_chosen_are_not_ranked(folder: Path, tmp_path: 
     for name in ("curves", "seeds"):
         rewrite(folder / f"{name}.parquet", lambda c: c.update(seed=[s + 5 * (s > 2) for s in c["seed"]]))
     edit(folder, lambda r: r["published"]["agents"].update(seeds=[s + 5 * (s > 2) for s in range(8)]))
-    found = api.board("tiny", runs=tmp_path / "entries")
-    assert not found.sections
-    assert "its 8 seeds are not 0 to 7 (3 is missing): not ranked" in found.refused[0]
-    assert "not ranked" in verify.verify(folder).message
-    (entry,), _ = collect.collect(collect.Selection(tmp_path / "entries"))
-    with pytest.raises(QrlSuiteError, match="3 is missing"):
-        compare_entries(entry, entry)
+    said = "5 of 13 seeds are missing: 3, 4, 5, 6, 7"
+    (section,) = api.board("tiny", runs=tmp_path / "entries").sections
+    assert (section.rows[0].time.ranks, said in section.as_dict()["missing"][0]) == (None, True)
+    assert said in verify.verify(folder).message
 
 
 def test_two_seeds_with_one_curve_are_refused(folder: Path) -> None:
@@ -475,7 +471,7 @@ def test_two_seeds_with_one_curve_are_refused(folder: Path) -> None:
 def test_what_is_published_with_the_suite_chose_no_seeds() -> None:
     for root in published.folders():
         for path in root.glob("*/*"):
-            assert not published.read(path).chosen_seeds
+            assert not published.read(path).entry_results().missing
 
 
 def test_boards_of_what_comes_with_the_suite_need_neither_torch_nor_matplotlib(tmp_path: Path) -> None:
