@@ -44,12 +44,12 @@ class Use(NamedTuple):
 def uses(circuit: Circuit) -> list[Use]:
     """Return the angles of a circuit that vary, in order of application; of a `Rot` each of the three."""
     steps = list(_steps(circuit))
-    state = _changed(steps, [frozenset("Z")] * circuit.qubits, heisenberg=False)
+    state = _changed(steps, [frozenset("Z")] * circuit.qubits)
     backward = []
     for qubits, axes in zip(circuit.measured, circuit.axes):
         word = dict(zip(qubits, axes))
         measured = [frozenset(word.get(q, "")) for q in range(circuit.qubits)]
-        backward.append(_changed(steps[::-1], measured, heisenberg=True)[::-1])
+        backward.append(_changed(steps[::-1], measured)[::-1])
     each = zip(steps, state, zip(*backward))
     return [Use(angle, before, after) for (*_, angle), before, after in each if angle is not None]
 
@@ -118,11 +118,11 @@ def _rotations(operation: Operation) -> Iterator[tuple[str, Angle, tuple[int, ..
             yield "RZ", angles[place], qubits[:1]
 
 
-def _changed(steps: list[Step], letters: list[Letters], heisenberg: bool) -> list[bool]:
+def _changed(steps: list[Step], letters: list[Letters]) -> list[bool]:
     """Return which steps change an operator with these Paulis on the qubits, moved through them."""
     letters, changes = list(letters), []
     for name, angle, controlled, qubits, _ in steps:
-        after, changed = _image(name, angle, controlled, tuple(letters[q] for q in qubits), heisenberg)
+        after, changed = _image(name, angle, controlled, tuple(letters[q] for q in qubits))
         for qubit, own in zip(qubits, after):
             letters[qubit] = own
         changes.append(changed)
@@ -131,16 +131,17 @@ def _changed(steps: list[Step], letters: list[Letters], heisenberg: bool) -> lis
 
 @cache
 def _image(
-    name: str, angle: float, controlled: bool, letters: tuple[Letters, ...], heisenberg: bool
+    name: str, angle: float, controlled: bool, letters: tuple[Letters, ...]
 ) -> tuple[tuple[Letters, ...], bool]:
-    """Return the Paulis on a gate's qubits behind it, and whether it changes any product of them."""
+    """Return the Paulis on a gate's qubits behind it, and whether it changes any product of them.
+
+    They are the same for the inverse of every gate here.
+    """
     gate: Any = FIXED.get(name)
     if gate is None:
         gate = np.cos(angle / 2) * PAULIS["I"] - 1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
     if controlled:
         gate = np.kron(np.diag([1, 0]), PAULIS["I"]) + np.kron(np.diag([0, 1]), gate)
-    if heisenberg:
-        gate = gate.conj().T
     after: list[set[str]] = [set() for _ in letters]
     changed = False
     for given in itertools.product(*({"I", *own} for own in letters)):

@@ -46,7 +46,7 @@ def circuit() -> QuantumCircuit:
     [
         (["ZIII", SUM, "YYII"], VALUES),
         (SUM, VALUES),
-        (SUM, VALUES[0]),
+        (SUM, VALUES[0, 0]),
         ([["ZIII"], [SUM], ["IIII"], ["IIXX"]], VALUES[0]),
         (["ZIII", "IXYZ", SUM], VALUES[0]),
     ],
