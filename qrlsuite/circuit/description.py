@@ -172,24 +172,16 @@ class Angle:
             return self._multiple(float(other))
         if isinstance(other, np.ndarray):  # numpy multiplies every element
             return NotImplemented
-        for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
-            times = a.times * b.times
-            if a.is_bare_input and (parameter := b._parameter):
-                return Angle(input=a.input, scale=parameter, factor=a.factor, times=times)
-            if a.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
-                return Angle(input=a.input, factor=b.input, times=times)
-            if a._is_scaled_input and b.is_bare_input and a.factor is b.factor is None:
-                return Angle(input=a.input, scale=a.scale, factor=b.input, times=times)
-        if isinstance(other, Angle) and not (self.elements or other.elements):
-            return Angle(input=Encoding("product", (self, other)))
-        for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
-            if b.elements:
-                continue
+        if isinstance(other, Angle) and not (self.elements and other.elements):
+            a, b = (other, self) if other.elements else (self, other)  # b has no parameter
             if parameter := a._parameter:
-                return Angle(input=Encoding("sum", (b,)), scale=parameter, times=a.times)
-            if a._is_scaled_input:
-                encoding = Encoding("product", (replace(a, scale=None, times=1.0), b))
-                return Angle(input=encoding, scale=a.scale, times=a.times)
+                whole = b if b.is_bare_input else Angle(input=Encoding("sum", (b,)))
+                return replace(whole, scale=parameter, times=a.times * whole.times)
+            if a._is_scaled_input or not a.elements:
+                inputs = replace(a, scale=None)
+                if inputs.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
+                    return Angle(input=a.input, scale=a.scale, factor=b.input, times=a.times * b.times)
+                return Angle(input=Encoding("product", (inputs, b)), scale=a.scale)
         what = (
             "products of parameters"
             if isinstance(other, Angle)
