@@ -145,8 +145,9 @@ def _ansatz(
             text = f"not computed where gates connect more than {LARGEST_RANK} qubits"
             content["resources"]["jacobian_rank"] = text if rank is None else rank
     numbers = (1,) if size else range(1, drawn.qubits + 3)
-    deeper = ((layers, circuit.ansatz(name, **{**sizes, "layers": layers})) for layers in numbers)
-    content["light_cone"] = lightcone.described(drawn, deeper)
+    content["light_cone"] = lightcone.described(
+        drawn, lambda layers: circuit.ansatz(name, **{**sizes, "layers": layers}), numbers
+    )
     if out is not None:
         write_atomically(out, pictures.encode(drawing.draw_figure(drawn), picture_format))
         content["figure"] = str(out)

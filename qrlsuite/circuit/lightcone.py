@@ -8,8 +8,9 @@ may fail: Paulis are kept qubit by qubit, without their correlations.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
 from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
+from qrlsuite.errors import OptionError
 
 PAULIS: dict[str, Matrix] = {"I": np.eye(2, dtype=np.complex128), "X": X, "Y": Y, "Z": Z}
 ROTATIONS = {"RX": "X", "RY": "Y", "RZ": "Z"}
@@ -63,19 +65,23 @@ def _seen(circuit: Circuit) -> list[set[int]]:
     return found
 
 
-def described(circuit: Circuit, sizes: Iterable[tuple[int, Circuit]]) -> dict[str, str]:
+def described(circuit: Circuit, build: Callable[[int], Circuit], numbers: Sequence[int]) -> dict[str, str]:
     """Describe what reaches the outputs of a circuit, in words.
 
     Parameters
     ----------
-    sizes:
-        The same ansatz by numbers of layers, in their order: they are read until every output sees every input.
+    build:
+        Returns the same ansatz with a number of layers, or refuses it with `OptionError`.
+    numbers:
+        The numbers of layers to look for the first with which every output sees every input.
     """
-    layers, least = 0, ""
-    for layers, each in sizes:
-        if all(len(inputs) == each.inputs for inputs in _seen(each)):
-            least = str(layers)
-            break
+    least = f"more than {numbers[-1]}"
+    for layers in numbers:
+        with contextlib.suppress(OptionError):
+            each = build(layers)
+            if all(len(inputs) == each.inputs for inputs in _seen(each)):
+                least = str(layers)
+                break
     alive = {element for use in uses(circuit) if use.alive for element in use.angle.elements}
     names = [
         parameter.written(k)
@@ -91,7 +97,7 @@ def described(circuit: Circuit, sizes: Iterable[tuple[int, Circuit]]) -> dict[st
         "dead_parameters": f"{len(names)} of {circuit.parameter_count}: {some}" if names else "none",
         "inputs_that_no_output_sees": ", ".join(map(str, unseen)) or "none",
         "inputs_that_an_output_sees": f"{' or '.join(map(str, counts))} of {circuit.inputs}",
-        "layers_until_every_output_sees_every_input": least or f"more than {layers}",
+        "layers_until_every_output_sees_every_input": least,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -40,7 +40,9 @@ def check(subject: Subject) -> list[Finding]:
     with one_thread():
         message = "every input and every parameter changes an expectation value"
         if rules.run("effects", message, lambda: _effects(circuits, grows)):
-            rules.findings[-1] = Finding("effects", True, f"{message}; {_light_cone(circuits)}")
+            rules.findings[-1] = Finding(
+                "effects", True, f"{message}; {_light_cone(build, options, circuits)}"
+            )
         same = "every installed backend gives the values of dense matrices"
         if rules.run("backends", same, lambda: _backends(circuits)):
             rules.run(
@@ -146,11 +148,13 @@ def _effects(circuits: Circuits, grows: bool) -> None:
             effects.require_middle(circuit, size)
 
 
-def _light_cone(circuits: Circuits) -> str:
+def _light_cone(build: Any, options: Any, circuits: Circuits) -> str:
     """Say what the structure of the largest circuit of up to three layers leaves without effect."""
     largest = max(size for size in circuits if size[1] in LAYERS)
-    deeper = sorted((layers, each) for (qubits, layers), each in circuits.items() if qubits == largest[0])
-    cone = lightcone.described(circuits[largest], deeper)
+    numbers = range(1, largest[0] + 3) if len(circuits) > 1 else (1,)
+    cone = lightcone.described(
+        circuits[largest], lambda k: cast(Circuit, build(largest[0], k, options)), numbers
+    )
     sees = "layers_until_every_output_sees_every_input"
     return (
         f"dead parameters ({effects.size(*largest)}): {cone['dead_parameters']}; "

@@ -47,7 +47,9 @@ def test_dead_parameters_and_unseen_inputs_have_no_gradient(seed: int, mean_fiel
     assert felt <= scalars
 
 
-@pytest.mark.parametrize("name", ["basic", "cx", "cz", "hsiao", "iqp", "jerbi", "skolik", "wang"])
+@pytest.mark.parametrize(
+    "name", ["basic", "cx", "cz", "hsiao", "iqp", "jerbi", "perez-salinas", "skolik", "wang"]
+)
 def test_of_built_in_circuits_no_other_parameter_is_dead(name: str) -> None:
     circuit = ansatz(name, 4, 3)
     assert alive(circuit) == effects.effective(circuit)
@@ -69,7 +71,7 @@ def chain(layers: int) -> Circuit:
 def test_a_chain_by_hand() -> None:
     # Z of qubit q goes back through the CNOTs to Z on qubits 0..q, which commutes with RZ; and RX of the first layer on
     # qubit 2 meets Z_0 in no way with one layer: an output sees 1, 2 or 3 inputs. With two, X and Y go back, too.
-    assert described(chain(1), [(k, chain(k)) for k in (1, 2, 3)]) == {
+    assert described(chain(1), chain, range(1, 5)) == {
         "dead_parameters": "3 of 3: w[0, 0], w[0, 1], w[0, 2]",
         "inputs_that_no_output_sees": "none",
         "inputs_that_an_output_sees": "1 or 2 or 3 of 3",
@@ -77,6 +79,6 @@ def test_a_chain_by_hand() -> None:
     }
     circuit = chain(1)
     circuit.measure([0])
-    said = described(circuit, [(1, circuit)])
+    said = described(circuit, lambda layers: circuit, (1,))
     assert said["inputs_that_no_output_sees"] == "1, 2"
     assert said["layers_until_every_output_sees_every_input"] == "more than 1"
