@@ -90,7 +90,7 @@ def read(selection: Selection, members: Sequence[Member]) -> dict[str, EntryResu
     curves_by_name = {}
     for entry in {member.entry.name: member.entry for member in members}.values():
         if copies := _copies(selection.folders, entry):
-            curves_by_name[entry.name] = collect.united(copies)[0]
+            curves_by_name[entry.name] = selection.shown(collect.united(copies)[0])
     return curves_by_name
 
 
@@ -185,9 +185,10 @@ def draw(
     study = find(name)
     named = {section.name: section for section in study.pictures}
     if kind not in named and kind in OF_LOOKS and study.looks is not None:
-        if settings or seeds is not None or horizon is not None:
+        if settings or seeds is not None or horizon is not None or selection.labels:
             raise OptionError(
-                f"picture '{kind}' of a study shows its looks as they are: leave the settings out"
+                f"picture '{kind}' of a study shows its looks as they are, with the names of its file: leave the "
+                "settings and --label out"
             )
         return _of_looks(kind, names, selection.runs)
     if kind not in named and kind not in pictures.KINDS:
@@ -216,7 +217,8 @@ def draw(
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: {drawn_by(name, section, members, selection.runs)}")
     folder = selection.runs if study.looks is None else read_outcome(name, selection.runs).study.folder
-    entries = list(read(Selection(folder, selection.published and data == "entries"), members).values())
+    among = Selection(folder, selection.published and data == "entries", labels=selection.labels)
+    entries = list(read(among, members).values())
     if not entries:
         hint = "; --published draws the entries that come with the suite"
         hint *= not selection.published and data == "entries"

@@ -107,7 +107,8 @@ class Selection:
             fitting = lookup.fitting(self.stored, name)
             if len({entry.name for entry in fitting}) != 1:
                 lookup.choose(self.stored, parts[0] if not fitting else name, self.runs)
-            if not text.strip() or text in found.values():
+            taken = {(key[0], used) for key, used in found.items()}
+            if not text.strip() or any((entry.task, text) in taken for entry in fitting):
                 raise OptionError(
                     f"--label {printable(word)}: write ENTRY=TEXT, and another text for each entry"
                 )

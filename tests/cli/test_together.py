@@ -14,6 +14,7 @@ from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.statistics.sequential import Decided
 from qrlsuite.studies.together import StudiesTogether, together
 from tests.commands import answer, say
+from tests.leaderboard.boards import refused
 
 TOGETHER = ("quantum-or-not", "quantum-or-not-degree5", "quantum-or-not-a3-0")
 
@@ -36,6 +37,9 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks(t
     shown = say("show", "study", *TOGETHER).stdout
     assert "nothing follows for other tasks" in shown
     assert shown.count("10 qubits / width 14") == 1
+    assert "leave the settings and --label out" in refused(
+        "plot", "pairs", "--study", TOGETHER[0], "--label", "a=b"
+    )
     say("show", "study", *TOGETHER, "--out", str(tmp_path / "table.tex"))
     assert (tmp_path / "table.tex").read_text().count("10 qubits / width 14 & ") == 1
 
