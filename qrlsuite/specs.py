@@ -95,11 +95,6 @@ class NumericSpec(Spec):
 
     numerics: int = field(default=1, kw_only=True)
 
-    @property
-    def declared(self) -> str:
-        """What seeds have in common by declaration, for the notes of boards; empty for nothing."""
-        return ""
-
 
 @dataclass(frozen=True, slots=True)
 class PictureSpec(Spec):
@@ -159,11 +154,6 @@ class EnvironmentSpec(NumericSpec):
     views: tuple[str, ...] = ()
     repeats: bool = False
 
-    @property
-    def declared(self) -> str:
-        """As for all parts."""
-        return f"{self.title}: the same episodes" * self.repeats
-
 
 @dataclass(frozen=True, slots=True)
 class ModelSpec(NumericSpec):
@@ -208,11 +198,6 @@ class ModelSpec(NumericSpec):
     quick: tuple[int, int] = (8, 10)
     backends: bool = False
     shared: tuple[str, ...] = ()
-
-    @property
-    def declared(self) -> str:
-        """As for all parts."""
-        return f"{self.title}: the same {', '.join(self.shared)} at the beginning" * bool(self.shared)
 
     def __post_init__(self) -> None:
         Spec.__post_init__(self)

@@ -22,12 +22,15 @@ suite's tests and are not probed.
 from __future__ import annotations
 
 import json
+import math
 import os
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from safetensors.numpy import load, save
 
-from qrlsuite import own
+from qrlsuite import own, specs
 from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
@@ -44,7 +47,6 @@ from qrlsuite.results import probes, provenance
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
-from qrlsuite.results.progress import Progress
 from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord, Provenance
 from qrlsuite.results.store import EntryStore, SeedStore, read_arrays
 
@@ -146,17 +148,8 @@ def difference(together: Side, alone: Side) -> str:
     return f"the state '{name}' after epoch {len(together.lines)}" if name else ""
 
 
-class _TooLongError(BaseException):
-    """Training has used up its processor time. No code of a plugin catches it."""
-
-
 def train(
-    entry: Entry,
-    seeds: Sequence[int],
-    epochs: int,
-    device: str = "cpu",
-    start: Path | None = None,
-    limit: float | None = None,
+    entry: Entry, seeds: Sequence[int], epochs: int, device: str = "cpu", start: Path | None = None
 ) -> Side:
     """Train seeds from nothing until the parameters of the middle one have changed, for some epochs at most.
 
@@ -164,19 +157,11 @@ def train(
     ----------
     start:
         The file of the agent with which all of them begin, where the entry begins with agents.
-    limit:
-        Seconds of processor time after which it ends with `_TooLongError`.
     """
     from qrlsuite.training.group import lines_of
     from qrlsuite.training.trainer import Trainer
 
-    began = time.process_time()
-
-    def tick(progress: Progress) -> None:
-        if limit is not None and time.process_time() - began > limit:
-            raise _TooLongError
-
-    trainer = Trainer(entry, seeds, device, tick)
+    trainer = Trainer(entry, seeds, device)
     first = {} if start is None else read_arrays(start)
     trainer.start({name: np.stack([value] * len(seeds)) for name, value in first.items()})
     recorder = Recorder(trainer)
@@ -187,15 +172,24 @@ def train(
     return recorder.side
 
 
-def _again(side: Side, took: float, entry: Entry, seeds: Sequence[int], *more: Any) -> str | None:
-    """Train another block's seed, and then the same seeds once more; return the first difference from a side.
+def _again(side: Side, entry: Entry, seeds: Sequence[int], device: str, start: Path | None) -> str:
+    """Train a seed of another block a little, and the same seeds once more; return the first difference from a side."""
+    from qrlsuite.training.trainer import Trainer
 
-    None if that would take too long, as by the processor time of the first training.
-    """
-    if 2 * took > SECONDS:
-        return None
-    train(entry, [seeds[0] + TUNING_SEEDS], 1, *more)
-    return difference(side, train(entry, seeds, len(side.lines), *more))
+    other = Trainer(entry, [seeds[0] + TUNING_SEEDS], device)
+    other.start()
+    with own.blamed():
+        other.algorithm.train_epoch(1)
+    return difference(side, train(entry, seeds, len(side.lines), device, start))
+
+
+def _declared(entry: Entry) -> Iterator[str]:
+    """Say what seeds have in common by declaration of plugins, for the notes of boards."""
+    for spec in (each.spec for each in entry.registered().values() if each.distribution != identity.OURS):
+        if isinstance(spec, specs.ModelSpec) and spec.shared:
+            yield f"{spec.title}: the same {', '.join(spec.shared)} at the beginning"
+        if isinstance(spec, specs.EnvironmentSpec) and spec.repeats:
+            yield f"{spec.title}: the same episodes"
 
 
 class _ProbeFailed(Exception):
@@ -209,9 +203,12 @@ def in_fresh_process(
     device: str,
     start: Path | None = None,
     again: bool = False,
-    limit: float | None = None,
+    limited: bool = False,
 ) -> tuple[Side, float]:
-    """Run `train` in a process that has run nothing else, then once more if `again`; return its processor time, too."""
+    """Run `train` in a process that has run nothing else, then once more if `again`; return its processor time, too.
+
+    If `limited`, training ends without an answer after `SECONDS`.
+    """
     task: dict[str, Any] = {
         "entry": EntryRecord.of(entry).content,
         "seeds": list(seeds),
@@ -219,7 +216,7 @@ def in_fresh_process(
         "device": device,
         "start": start and str(start),
         "again": again,
-        "limit": limit,
+        "limited": limited,
     }
     task["plugins"] = [str(plugin.copy) for plugin in identity.plugins(entry)]
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
@@ -295,7 +292,7 @@ class Probe:
         if elsewhere := provenance.difference(here, there):
             return f"{skipped}{elsewhere}"
         try:
-            side, _ = in_fresh_process(self.entry, [self.seed], 1, self.device, self.start, limit=SECONDS)
+            side, _ = in_fresh_process(self.entry, [self.seed], 1, self.device, self.start, limited=True)
             found = difference(Side([lines[0].content], {}), replace(side, arrays={}))
         except _ProbeFailed as error:
             return f"{skipped}{error}"
@@ -333,8 +330,7 @@ class Probe:
             "device": self.device.partition(":")[0],
             "code": code_of(self.entry),
         }
-        parts = [each for each in self.entry.registered().values() if each.distribution != identity.OURS]
-        if declared := [each.spec.declared for each in parts if each.spec.declared]:
+        if declared := list(_declared(self.entry)):
             facts["declared"] = declared
 
         def found(result: str, **more: Any) -> ProbeRecord:
@@ -410,6 +406,12 @@ def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
     return Probe(entry, seed, epochs, device, claim, start, recorded, bool(made))
 
 
+def _end(*signal: object) -> None:
+    """End this process, whatever a plugin catches."""
+    print(f"an epoch takes more than {SECONDS:g} s of processor time", flush=True)
+    os._exit(2)
+
+
 def main(arguments: Sequence[str]) -> int:
     """Be the fresh process; returns its exit code."""
     from qrlsuite.engine.worker import end_with
@@ -425,15 +427,16 @@ def main(arguments: Sequence[str]) -> int:
             own.load(path)
         start = None if task["start"] is None else Path(task["start"])
         entry = EntryRecord.read(task["entry"], "the probe").entry("the probe")
-        began, more = time.process_time(), (task["device"], start, task["limit"])
+        began, more = time.process_time(), (task["device"], start)
+        if task["limited"]:
+            signal.signal(signal.SIGXCPU, _end)
+            most = math.ceil(began + SECONDS)
+            resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
         side = train(entry, task["seeds"], task["epochs"], *more)
         took = time.process_time() - began
-        again = _again(side, took, entry, task["seeds"], *more) if task["again"] else None
+        again = _again(side, entry, task["seeds"], *more) if task["again"] and took <= SECONDS else None
         header |= {"lines": side.lines, "changed": side.changed, "again": again}
         arrays = side.arrays
-    except _TooLongError:
-        print(f"an epoch takes more than {task['limit']:g} s of processor time")
-        return 2
     except (PluginError, EnvironmentFailure) as error:
         header["error"] = str(error)
     except QrlSuiteError as error:  # there is no such device here, say

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib
 import json
-import math
 import os
 import subprocess
 import sys
@@ -14,8 +12,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from qrlsuite import hookspecs, own, registry, specs
-from qrlsuite import options as option_values
-from qrlsuite.testing.findings import BrokenRuleError
 
 HEAVY = (
     "torch", "pennylane", "qiskit", "cirq", "numba", "gymnasium", "scipy", "matplotlib", "pandas", "sklearn",
@@ -23,8 +19,6 @@ HEAVY = (
 )  # fmt: skip
 """Packages that take long to import, and so must wait until a command needs them."""
 
-ORDERS = ((0, 1), (1, 0))
-_BUILD = "build"
 _MARK = "qrlsuite.testing.fresh "
 """Before the result, for imported modules may print."""
 
@@ -95,83 +89,8 @@ def resolved(references: Sequence[str]) -> dict[str, str | None]:
     return errors
 
 
-def built_in_order(subject: Any, shape: Sequence[int], outputs: int) -> dict[int, tuple[str, str]]:
-    """Build two seeds of a model in two new interpreters, one in each order.
-
-    Parameters
-    ----------
-    shape:
-        Of an observation.
-
-    Returns
-    -------
-    dict
-        By seed, digests of its parameters and buffers where it was built first and second.
-    """
-    common = [subject.spec.build, subject.spec.options, dict(subject.settings), [*shape], outputs]
-    processes = [
-        subprocess.Popen(
-            [
-                sys.executable,
-                "-W",
-                "ignore",
-                "-m",
-                __name__,
-                json.dumps([_plugins(), _BUILD, *common, order]),
-            ],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment(),
-        )
-        for order in ORDERS
-    ]
-    answers = []
-    for process in processes:
-        out, err = process.communicate()
-        answer = next((line for line in out.splitlines() if line.startswith(_MARK)), None)
-        if answer is None:
-            raise BrokenRuleError(
-                f"it cannot be built in a fresh process: {(err.strip() or 'no message').splitlines()[-1]}"
-            )
-        answers.append(json.loads(answer.removeprefix(_MARK)))
-    return {seed: (answers[seed][str(seed)], answers[1 - seed][str(seed)]) for seed in ORDERS[0]}
-
-
-def _build(
-    build: str,
-    options: str,
-    settings: dict[str, Any],
-    shape: Sequence[int],
-    outputs: int,
-    order: Sequence[int],
-) -> dict[int, str]:
-    """Build seeds in this process, one after the other; returns digests of their parameters and buffers."""
-    import torch
-    from gymnasium.spaces import Box
-
-    from qrlsuite.training.fences import seeded
-    from qrlsuite.training.trainer import build_agent
-
-    space = Box(0.0, 1.0, tuple(shape))
-    chosen = option_values.build(specs.resolve(options), settings, "the model")
-    digests = {}
-    for seed in order:
-        with seeded(seed):
-            generator = torch.Generator().manual_seed(seed)
-            module = build_agent(specs.resolve(build), math.prod(shape), outputs, chosen, generator, space)
-        content = hashlib.sha256()
-        for name, value in module.state_dict().items():
-            content.update(
-                name.encode() + value.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes()
-            )
-        digests[seed] = content.hexdigest()
-    return digests
-
-
 if __name__ == "__main__":
     _paths, *_given = json.loads(sys.argv[1])
     for _path in _paths:
         own.load(_path)
-    _result = _build(*_given[1:]) if _given[0] == _BUILD else _look(*_given)
-    print(f"\n{_MARK}{json.dumps(_result)}")
+    print(f"\n{_MARK}{json.dumps(_look(*_given))}")

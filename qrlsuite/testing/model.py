@@ -18,7 +18,6 @@ from qrlsuite import population as populations
 from qrlsuite import specs
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
-from qrlsuite.testing.fresh import built_in_order
 from qrlsuite.testing.group import World
 from qrlsuite.training import questions, unregistered
 from qrlsuite.training.fences import seeded
@@ -133,13 +132,6 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
         rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(subjects))
         rules.run("same seed", "the generator alone decides the parameters", lambda: _same(subjects))
         rules.run("different seed", "every generator gives other parameters", lambda: _different(subjects))
-        of_others = subject.modules and subject.distribution != "qrlsuite"  # whose streams its tests hold
-        if of_others and isinstance(subjects.space, Box):
-            rules.run(
-                "build order",
-                "a seed has its parameters, whichever is built first",
-                lambda: _order(subject, subjects),
-            )
         rules.run("global randomness", "a pass moves no global generator", lambda: _global(subjects))
         rules.run("pure", "a pass changes neither inputs nor results of the next", lambda: _pure(subjects))
         if not subjects.sampled:
@@ -294,17 +286,6 @@ def _different(subjects: Subjects) -> None:
         "the second network from one generator (a critic, say) equals the first: draw from the generator, do not "
         "only read its seed",
     )
-
-
-def _order(subject: Subject, subjects: Subjects) -> None:
-    """Build two seeds in fresh processes, in both orders."""
-    for seed, (first, second) in built_in_order(subject, subjects.space.shape, OUT).items():
-        require(
-            first == second,
-            f"seed {seed} has other parameters where another seed is built before it: something is kept from the first "
-            "build (a global variable, a class attribute, a default argument, functools.cache), and shared by all "
-            "seeds; draw it in every `build`",
-        )
 
 
 def _global(subjects: Subjects) -> None:

@@ -137,12 +137,12 @@ class _Lanes:
         return sum(first != second for first, second in itertools.pairwise(self.episodes[lane]))
 
 
-def require_reproducible(make: Make, spec: specs.EnvironmentSpec, limit: float = SECONDS) -> None:
+def require_reproducible(make: Make, spec: specs.EnvironmentSpec) -> None:
     """Refuse lanes that show something else in other lanes of the same streams, which are built after them."""
     first, second = _Lanes(make, 0), _Lanes(make, 1)
     began = time.process_time()
     for _ in range(STEPS):
-        if time.process_time() - began > limit / 10:
+        if time.process_time() - began > SECONDS / 10:
             break
         first.step()
         second.step()
@@ -152,16 +152,13 @@ def require_reproducible(make: Make, spec: specs.EnvironmentSpec, limit: float =
         )
 
 
-def drawn(
-    make: Make, spec: specs.EnvironmentSpec, limit: float = SECONDS
-) -> Literal["drawn", "alike", "unknown"]:
+def drawn(make: Make, spec: specs.EnvironmentSpec) -> Literal["drawn", "alike", "unknown"]:
     """Refuse an environment whose episodes differ from one to the next, but not between lanes or seeds.
 
     Returns
     -------
     str
-        Whether lanes draw episodes of their own, or all episodes are alike; "unknown" after `limit` seconds of
-        processor time.
+        Whether lanes draw episodes of their own, or all episodes are alike; "unknown" after `SECONDS`.
     """
     lanes, began = _Lanes(make, 0), time.process_time()
     for taken in itertools.count():
@@ -174,7 +171,7 @@ def drawn(
             break
         if taken >= STEPS and max(changes) == 0 and all(len(lanes.episodes[lane]) > 1 for lane in alike):
             return "alike"
-        if time.process_time() - began > limit:
+        if time.process_time() - began > SECONDS:
             return "unknown"
         lanes.step()
     whose = "seeds" if shown[0] == shown[len(shown) // 2] else "lanes of a seed"
