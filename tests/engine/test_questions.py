@@ -55,7 +55,10 @@ class Walk(gymnasium.Env):
         seen = self.show()
         return seen, float(action == seen[0]), self.left == 0, False, {}
 """
-"""Honest, and lanes often meet the same episode: there are 64 of them."""
+COIN = WALK.replace("self.left = 5", "self.left, self.side = 5, self.np_random.random()").replace(
+    "(self.rng or self.np_random).random()", "self.side"
+)
+"""Honest, and lanes often meet the same episode: there are two."""
 NOISE = WALK.replace("self.rng = None", "self.rng = np.random.default_rng(0)")
 GLOBAL = WALK.replace("self.rng = None", "self.rng = np.random")
 ALIKE = WALK.replace("[(self.rng or self.np_random).random() > 0.5]", "[self.left % 2]")
@@ -120,7 +123,7 @@ def test_boards_name_what_seeds_have_in_common_by_declaration(
     assert re.search(rf"seeds have in common by declaration: .* \({declared}\)", " ".join(board.split()))
 
 
-@pytest.mark.parametrize("code", [WALK, ALIKE], ids=["honest", "alike"])
+@pytest.mark.parametrize("code", [WALK, COIN, ALIKE], ids=["honest", "coin", "alike"])
 def test_lanes_with_episodes_of_their_own_or_without_noise_are_trained(code: str, tmp_path: Path) -> None:
     exit_code, said = run(tmp_path, code, "mlp width=2", "--task", "walk", "--seeds", "2")
     assert (exit_code, "was not asked" in said) == (0, False), said
