@@ -406,7 +406,7 @@ def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
     return Probe(entry, seed, epochs, device, claim, start, recorded, bool(made))
 
 
-def _end(*signal: object) -> None:
+def _end(*given: object) -> None:
     """End this process, whatever a plugin catches."""
     print(f"an epoch takes more than {SECONDS:g} s of processor time", flush=True)
     os._exit(2)
