@@ -538,7 +538,7 @@ def _notes(
     held = [seed for seed, end in ends.items() if end < length]
     if early is not None and held:
         notes.append(f"'{entry}': seeds {format_seeds(held)} end early: {EARLY[early]}")
-    if len(seeds) < MIN_RUNS:
+    if len(seeds) < LEAST_RUNS:
         needed = f"a verdict needs {LEAST_RUNS} of each entry, a rank on a board {MIN_RUNS}"
         notes.append(f"'{entry}' has {counted(len(seeds), 'seed')}: {needed}")
     return notes
