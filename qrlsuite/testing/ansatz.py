@@ -38,11 +38,12 @@ def check(subject: Subject) -> list[Finding]:
     rules.run("parameters used", "every trainable scalar sets an angle", lambda: _parameters(circuits))
     grows = rules.run("layers", "more layers make a longer circuit", lambda: _layers(circuits))
     with one_thread():
-        message = "every input and every parameter changes an expectation value"
-        if rules.run("effects", message, lambda: _effects(circuits, grows)):
-            rules.findings[-1] = Finding(
-                "effects", True, f"{message}; {_light_cone(build, options, circuits)}"
-            )
+
+        def effective() -> str:
+            _effects(circuits, grows)
+            return _light_cone(build, options, circuits)
+
+        rules.run("effects", "every input and every parameter changes an expectation value", effective)
         same = "every installed backend gives the values of dense matrices"
         if rules.run("backends", same, lambda: _backends(circuits)):
             rules.run(

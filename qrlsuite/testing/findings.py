@@ -42,12 +42,12 @@ def require(holds: bool, message: str) -> None:
         raise BrokenRuleError(message)
 
 
-_watcher: ContextVar[Callable[[str], None]] = ContextVar("_watcher", default=lambda rule: None)
+_watcher: ContextVar[Callable[[str | Finding], None]] = ContextVar("_watcher", default=lambda seen: None)
 
 
 @contextlib.contextmanager
-def watching(call: Callable[[str], None]) -> Iterator[None]:
-    """Have `call(rule)` called before every rule that is checked, for a progress display."""
+def watching(call: Callable[[str | Finding], None]) -> Iterator[None]:
+    """Have `call` called with the name of every rule before it is checked, and with its finding then."""
     token = _watcher.set(call)
     try:
         yield
@@ -77,20 +77,24 @@ class Checklist:
         looked_at:
             What a passing check has established.
         check:
-            Raises `BrokenRuleError` or `PluginError` where the rule is broken. Any other exception breaks it too.
+            Raises `BrokenRuleError` or `PluginError` where the rule is broken. Any other exception breaks it too. A
+            returned text is what else it has established.
         cause:
             The likely cause of another exception.
         """
         _watcher.get()(rule)
         try:
-            check()
+            more = check()
         except (BrokenRuleError, PluginError) as error:
             self.findings.append(Finding(rule, False, str(error)))
         except Exception as error:  # whatever a stranger's code raises is the stranger's to read
             hint = f"; {cause}" if cause else ""
             self.findings.append(Finding(rule, False, f"{type(error).__name__}: {error}{hint}"))
         else:
-            self.findings.append(Finding(rule, True, looked_at))
+            self.findings.append(
+                Finding(rule, True, f"{looked_at}; {more}" if isinstance(more, str) else looked_at)
+            )
+        _watcher.get()(self.findings[-1])
         return self.findings[-1].ok
 
 

@@ -95,6 +95,18 @@ def check(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     return run
 
 
+def test_a_rule_is_printed_before_the_next_is_tried(check: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A check that hangs has said how far it came; one that ends with the process, too."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qrlsuite.testing.common._options", stop)
+    out = check("tidy-too")[1]
+    assert "  ✓ options documented: every option has a description" in out
+    assert "options: defaults" not in out
+
+
 def test_by_name_every_rule_is_shown_and_a_broken_one_is_exit_code_1(check: Command) -> None:
     code, out, err = check("tidy-too")
     lines = out.splitlines()

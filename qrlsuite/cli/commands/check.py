@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -109,28 +108,40 @@ def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
 def _show(
     items: list[CheckTarget], settings: dict[str, Any], more: dict[str, Any]
 ) -> list[tuple[CheckTarget, list[Finding]]]:
-    """Check things one after another, and show the current one in the last line of a terminal."""
+    """Check things one after another: print each rule as it holds or breaks, and the current one in a terminal."""
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     results = []
     with console.status("") as status:
 
-        def announce(item: CheckTarget) -> Callable[[str], None]:
-            return lambda rule: status.update(Text(printable(f"{item.title}: {rule}")))
+        def follow(seen: str | Finding) -> None:
+            if isinstance(seen, Finding):
+                printed.append(seen)
+                _print(console, seen)
+            else:
+                status.update(Text(printable(f"{item.title}: {seen}")))
 
         for item in items:
-            with watching(announce(item)):
-                findings = _findings(item, settings, more)
-            results.append((item, findings))
+            printed = list[Finding]()
             loaded = "" if item.kind.kind in testing.KINDS else " (only loading and registering are checked)"
             console.print(printable(f"{item.title}{loaded}"), style="bold")
+            with watching(follow):
+                findings = _findings(item, settings, more)
+            results.append((item, findings))
             for finding in findings:
-                _print(console, finding)
+                if not any(finding is each for each in printed):
+                    _print(console, finding)
     broken = sum(not finding.ok for _, findings in results for finding in findings)
     total = sum(len(findings) for _, findings in results)
     if broken:
         console.print(
             f"{broken} of {total} rules broken; some are tried only after these hold", style="bold red"
         )
+        if "task" not in more and any(
+            item.kind in (specs.AlgorithmSpec, specs.ModelSpec) and not finding.ok
+            for item, findings in results
+            for finding in findings
+        ):
+            console.print("it was tried on a toy: --task NAME tries it on a task's environment", style="dim")
     else:
         console.print(f"all {total} rules hold", style="bold green")
     return results
