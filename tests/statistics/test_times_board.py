@@ -154,6 +154,21 @@ def test_only_pairs_near_their_level_are_relabeled_further() -> None:
     assert (stopped.n_relabelings == CHUNK).all()
 
 
+def test_a_pair_behind_one_that_holm_keeps_is_not_relabeled_further() -> None:
+    """Of p .04 and .05, Holm keeps the first at .025, so that the second's level of .05 decides nothing."""
+    generator = np.random.default_rng(4)
+    pairs = [tuple(generator.integers(50, 100, (2, 20, 1))) for _ in range(300)]
+    test = MaxT(pairs, ratio=True)  # type: ignore[arg-type]
+    test.extend(CHUNK)
+    kept, near = (int(np.abs(test.p - p).argmin()) for p in (0.04, 0.05))
+    assert test.p[[kept, near]] == pytest.approx([0.04, 0.05], abs=0.005)
+    alone, both = (MaxT([pairs[k] for k in chosen], ratio=True) for chosen in ([near], [kept, near]))  # type: ignore[misc]
+    settle(alone, 0.05)
+    settle(both, 0.05)
+    assert alone.n_relabelings[0] > CHUNK
+    assert both.n_relabelings.tolist() == [CHUNK, CHUNK]
+
+
 def test_equals_are_rarely_told_apart_and_seeds_decide() -> None:
     model, generator = SmoothedRuns(entry(0)), np.random.default_rng(1)
     found = 0
