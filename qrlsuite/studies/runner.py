@@ -20,7 +20,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import Missing
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, QrlSuiteError, listed
 from qrlsuite.options import Setting
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed
@@ -242,6 +242,8 @@ def train_missing(
 ) -> tuple[str, ...]:
     """Train missing seeds, the entry that lacks least first; return one line for each that was handed to a queue.
 
+    Where an entry fails, the others go on, and the end says which.
+
     Parameters
     ----------
     budget, began:
@@ -249,15 +251,23 @@ def train_missing(
     """
     lacking = sorted((work for work in works if work.groups), key=lambda work: work.left)
     require_trainable([work.entry for work in lacking], where, quiet)
-    limit, submitted = seconds(budget, where.workers), []
+    limit, submitted, failed = seconds(budget, where.workers), list[str](), dict[str, QrlSuiteError]()
     for number, planned in enumerate(lacking, start=1):
         if limit is not None and time.monotonic() - began >= limit:
             break
         work = find(planned.runs, planned.entry, where, planned.seeds, planned.epochs)
         display = RunDisplay(work, where.workers, quiet)
         display.console.print(f"\n[bold]{number} of {len(lacking)}[/bold]", end="  ")
-        outcome = train(work, where, display, budget, began=began)
+        try:
+            outcome = train(work, where, display, budget, began=began)
+        except QrlSuiteError as error:
+            failed[planned.entry.label] = error
+            display.console.print(f"failed: {error}", markup=False, soft_wrap=True)
+            continue
         submitted += [] if outcome.submitted is None else [outcome.submitted]
+    for label, first in failed.items():
+        others = f"; likewise failed: {listed([*failed][1:])}" if len(failed) > 1 else ""
+        raise type(first)(f"{label}: {first}{others}")
     return tuple(submitted)
 
 

@@ -17,7 +17,7 @@ from qrlsuite import registry, specs
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.worker import train_group
-from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import task
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.shelf import published_studies
@@ -111,6 +111,24 @@ def widths(tmp_path: Path) -> str:
     path = tmp_path / "widths.toml"
     path.write_text(STUDY.replace("TASK", str(tmp_path / "tiny.toml")))
     return str(path)
+
+
+def test_other_entries_go_on_where_one_fails(
+    widths: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first of three that are trained: the one that lacks least, in order."""
+    run = Here.run
+
+    def failing(self: Here, works: Sequence[Work], show: Show) -> EngineOutcome:
+        if "width=16" in works[0].store.record().label:
+            raise StoreError("no room")
+        return run(self, works, show)
+
+    monkeypatch.setattr(Here, "run", failing)
+    words = ("study", "run", widths, "--engine", "here", "--seeds", "1", "--epochs", "1")
+    with pytest.raises(StoreError, match="^ddqn mlp width=16: no room$"):
+        say(*words, "--runs", str(tmp_path / "runs"))
+    assert [label for label, _ in Here.trained] == ["ddqn mlp width=4", "ddqn vqc-native qubits=2 layers=1"]
 
 
 STUDIES = [name for name, each in registry.load().of(StudySpec).items() if each.distribution == "qrlsuite"]
