@@ -126,7 +126,7 @@ def test_other_entries_go_on_where_one_fails(
 
     monkeypatch.setattr(Here, "run", failing)
     words = ("study", "run", widths, "--engine", "here", "--seeds", "1", "--epochs", "1")
-    with pytest.raises(StoreError, match="^ddqn mlp width=16: no room$"):
+    with pytest.raises(StoreError, match=r"^ddqn mlp width=16: no room$"):
         say(*words, "--runs", str(tmp_path / "runs"))
     assert [label for label, _ in Here.trained] == ["ddqn mlp width=4", "ddqn vqc-native qubits=2 layers=1"]
 
