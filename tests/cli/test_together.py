@@ -61,7 +61,7 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
         assert tuple(tasks) == read.tasks
         assert mean == f"mean of 3 tasks: {shared.verdict}"
         own = [
-            pair.interval
+            pair.shown[1:]
             for study in read.studies
             for pair in study.pairs
             if (pair.first, pair.second) == (shared.first, shared.second)

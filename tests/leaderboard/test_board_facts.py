@@ -86,8 +86,8 @@ def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.
     best, one, two = (row.entry for row in mostly_at_the_cap.sections[0].tiers)
     neither = "not reached: both are at the cap in all 49 cells"
     most = "significantly fewer samples in 7 of 49 cells, significantly more in none; both at the cap in 42"
-    assert compare_entries(one, two).sentence == neither
-    assert compare_entries(best, two).sentence == f"outperforms: {most}"
+    assert compare_entries(one, two).as_dict()["sentence"] == neither
+    assert compare_entries(best, two).as_dict()["sentence"] == f"outperforms: {most}"
 
 
 def test_a_tier_says_on_how_few_cells_it_rests() -> None:
