@@ -501,10 +501,7 @@ def _recognized(module: ModuleType, source: Source) -> list[Registered[Any]]:
     """Return the short forms in a module."""
     if short := shortforms.recognized(module):
         return [_registered(thing, module, source, _place(thing)) for thing in short]
-    advice = (
-        "write a function (qubits, layers) that returns a Circuit, a torch.nn.Module, gymnasium.Env or algorithm "
-        "class, or call qrlsuite.register(...)"
-    )
+    advice = f"write {shortforms.FORMS}, or call qrlsuite.register(...)"
     lacking = shortforms.lacking(shortforms.public(module))
     raise PluginError(f"{source.path} registers nothing: {lacking or advice}")
 

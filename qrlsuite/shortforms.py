@@ -84,11 +84,11 @@ def is_qnode(thing: Any) -> bool:
 
 
 def is_quantum_function(thing: Any) -> bool:
-    """Return whether this is a QNode, or a function beside `weight_shapes` whose first parameter is `inputs`."""
-    if is_qnode(thing):
-        return True
-    named = inspect.isfunction(thing) and list(inspect.signature(thing).parameters)[:1] == ["inputs"]
-    return named and "pennylane" in sys.modules and SHAPES in thing.__globals__
+    """Return whether this is a QNode, or a function of `inputs` and of weights whose shapes are beside it."""
+    if is_qnode(thing) or not inspect.isfunction(thing):
+        return is_qnode(thing)
+    needs = {each.name for each in _parameters(thing) if each.default is each.empty}
+    return "pennylane" in sys.modules and {"inputs"} < needs <= {"inputs", *thing.__globals__.get(SHAPES, ())}
 
 
 def source_of(function: Any) -> Any:
@@ -106,7 +106,7 @@ def shapes_of(function: Any) -> Mapping[str, Any]:
     """
     source = source_of(function)
     shapes = source.__globals__.get(SHAPES, {})
-    _, *others = inspect.signature(source).parameters.values()
+    others = [each for each in _parameters(source) if each.name != inputs_of(function)]
     for each in others:
         if each.default is each.empty and each.name not in shapes:
             raise PluginError(
@@ -114,6 +114,12 @@ def shapes_of(function: Any) -> Mapping[str, Any]:
                 f'{SHAPES} = {{"{each.name}": lambda qubits, layers: (layers, qubits, 3)}}, or the shape in numbers'
             )
     return {each.name: shapes[each.name] for each in others if each.name in shapes}
+
+
+def inputs_of(function: Any) -> str:
+    """Return the name of a quantum function's parameter for inputs: `inputs`, as for TorchLayer, or the first one."""
+    names = [each.name for each in _parameters(source_of(function))]
+    return "inputs" if "inputs" in names or not names else names[0]
 
 
 def has_one_size(function: Any) -> bool:
@@ -146,14 +152,16 @@ def _builds_circuits(function: Callable[..., Any]) -> bool:
 
 
 def public(module: ModuleType) -> list[Any]:
-    """Return the public functions and classes that are defined in a module."""
-    return [
+    """Return the public functions and classes that are defined in a module; of a QNode's function the QNode."""
+    things = [
         thing
         for name, thing in vars(module).items()
         if not name.startswith("_")
         and getattr(thing, "__module__", "").partition(".")[0] == module.__name__
-        and getattr(thing, "__name__", None) == name
+        and (getattr(thing, "__name__", None) == name or is_qnode(thing))
     ]
+    inner = [source_of(thing) for thing in things if is_qnode(thing)]
+    return [thing for thing in things if thing not in inner]
 
 
 def recognized(module: ModuleType) -> list[Any]:
@@ -220,7 +228,7 @@ def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
     """
     kind = kind_of(thing)
     if kind is None:
-        raise PluginError(f"{_title(thing)} cannot be registered: {lacking([thing]) or _REFUSED}")
+        raise PluginError(f"{_title(thing)} cannot be registered: {lacking([thing]) or f'write {FORMS}'}")
     name = kebab(thing.__name__)
     if not specs.NAME.fullmatch(name):
         raise PluginError(
@@ -240,9 +248,9 @@ def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
     )
 
 
-_REFUSED = (
-    "it is neither a spec nor a function (qubits, layers) that returns a Circuit, a torch.nn.Module, gymnasium.Env or "
-    "algorithm class"
+FORMS = (
+    "a function (qubits, layers) that returns a Circuit, a QNode, a function (inputs, weights) beside weight_shapes, a "
+    "torch.nn.Module, gymnasium.Env or algorithm class"
 )
 
 
@@ -279,7 +287,7 @@ def _ansatz(function: Callable[..., Any], name: str, summary: str, holder: _Hold
     if is_quantum_function(function):
         try:
             options, call = _signature(
-                source_of(function), ("inputs",), tuple(shapes_of(function)), more=_ENTANGLED
+                source_of(function), (), (inputs_of(function), *shapes_of(function)), more=_ENTANGLED
             )
 
             def build(qubits: int | None, layers: int, chosen: Any) -> Any:
@@ -413,11 +421,7 @@ def _signature(
     more:
         Further options, where there is no such parameter: name, annotation, default.
     """
-    parameters = [
-        each
-        for each in inspect.signature(thing).parameters.values()
-        if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
-    ]
+    parameters = _parameters(thing)
     written = f"{thing.__name__}({', '.join([*first, *named, '...'])})"
     if len(parameters) < len(first) or any(p.kind is p.KEYWORD_ONLY for p in parameters[: len(first)]):
         raise PluginError(f"{_title(thing)} takes {len(parameters)} arguments, and is called as {written}")
@@ -444,6 +448,12 @@ def _signature(
     )
     names = [each.name for each in rest]
     return made, _calling(thing, takes, lambda chosen: {name: getattr(chosen, name) for name in names})
+
+
+def _parameters(thing: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the parameters that have a name of their own."""
+    every = inspect.signature(thing).parameters.values()
+    return [each for each in every if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
 
 
 def _calling(thing: Callable[..., Any], takes: set[str], unfold: Callable[[Any], Mapping[str, Any]]) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -70,8 +71,12 @@ def layer(
             raise OptionError(f"say how many qubits: layer('{circuit}', qubits=6)")
         circuit = ansatz(circuit, qubits, layers, **options)
     elif not isinstance(circuit, Circuit):
-        call = functools.partial(shortforms.source_of(circuit), **options)
-        circuit = tracing.trace(circuit, qubits, layers, call)
+        source = shortforms.source_of(circuit)
+        if not inspect.isfunction(source):
+            raise OptionError(
+                f"layer({circuit!r}): give the name of an ansatz, a Circuit, or a QNode or its function"
+            )
+        circuit = tracing.trace(circuit, qubits, layers, functools.partial(source, **options))
     elif qubits is not None or layers != 1 or options:
         raise OptionError(
             "a circuit of your own has its size and options already: leave out qubits, layers and others"

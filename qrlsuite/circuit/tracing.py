@@ -12,8 +12,10 @@ PennyLane decomposes the gates that a `Circuit` does not have.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import linecache
+import operator
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -23,11 +25,10 @@ import numpy as np
 
 from qrlsuite.circuit.description import FUNCTIONS, Angle, Circuit
 from qrlsuite.errors import CircuitError, OptionError, QrlSuiteError
-from qrlsuite.shortforms import SHAPES, has_one_size, shapes_of, source_of
+from qrlsuite.shortforms import SHAPES, has_one_size, inputs_of, shapes_of, source_of
 
 MOST_INPUTS = 64
-MORE_INPUTS = 9
-"""How many numbers of inputs are tried, from one per qubit on."""
+"""Numbers of inputs that are tried, from one per qubit on."""
 
 GATES: dict[str, tuple[str, bool]] = {
     **{name: (name, False) for name in ("RX", "RY", "RZ", "Rot", "U3", "S", "T", "CNOT", "CZ", "SWAP")},
@@ -82,7 +83,7 @@ def trace(
     name = source.__name__
     draft = Circuit(1, MOST_INPUTS)
     weights = {
-        each: _array(draft, each, _shape(shape, qubits, layers))
+        each: _array(draft, each, _shape(each, shape, qubits, layers))
         for each, shape in shapes_of(function).items()
     }
     if has_one_size(function) and layers != 1:
@@ -91,12 +92,15 @@ def trace(
             "a function of qubits and layers"
         )
     labels = list(getattr(getattr(function, "device", None), "wires", None) or ())
-    tape, results, lines = _run(call or source, source, draft, qubits or len(labels) or 1, weights)
+    called = functools.partial(call or source, **weights)
+    tape, results, lines = _run(function, called, draft, qubits or len(labels) or 1)
     words = [_word(each, name) for each in results]
     used = set(tape.wires).union(*words)
     if not labels:
         numbered = all(isinstance(wire, int) for wire in used)
-        labels = list(range(max(used, default=0) + 1)) if numbered else sorted(used)
+        labels = list(range(max(used, default=0) + 1)) if numbered else sorted(used, key=str)
+        if qubits is None and len(labels) > 1:  # the function gets an input for each
+            return trace(function, len(labels), layers, call, mean_field)
     if strange := used.difference(labels):
         raise CircuitError(
             f"'{name}' uses the wire {min(strange, key=str)!r}, which its device does not have"
@@ -126,14 +130,21 @@ def trace(
     return circuit
 
 
-def _shape(shape: Any, qubits: int | None, layers: int) -> tuple[int, ...]:
+def _shape(name: str, shape: Any, qubits: int | None, layers: int) -> tuple[int, ...]:
     """Return a shape as PennyLane's TorchLayer reads it, or that of its function for a size."""
-    if callable(shape):
-        size = {"qubits": qubits, "n_wires": qubits, "layers": layers, "n_layers": layers}
-        shape = shape(**{name: size[name] for name in inspect.signature(shape).parameters if name in size})
-    if isinstance(shape, int):
-        return () if shape == 1 else (shape,)
-    return tuple(map(int, shape))
+    try:
+        if callable(shape):
+            size = {"qubits": qubits, "n_wires": qubits, "layers": layers, "n_layers": layers}
+            shape = shape(
+                **{word: size[word] for word in inspect.signature(shape).parameters if word in size}
+            )
+        if isinstance(shape, int):
+            return () if shape == 1 else (shape,)
+        return tuple(map(operator.index, shape))
+    except (TypeError, ValueError) as error:
+        raise CircuitError(
+            f"{SHAPES}: '{name}': {error}; write whole numbers, such as (2, 4, 3), or a function of qubits and layers"
+        ) from error
 
 
 def _array(draft: Circuit, name: str, shape: tuple[int, ...]) -> Any:
@@ -148,17 +159,17 @@ def _array(draft: Circuit, name: str, shape: tuple[int, ...]) -> Any:
 
 
 def _run(
-    call: Callable[..., Any], source: Any, draft: Circuit, count: int, weights: Mapping[str, Any]
+    function: Any, call: Callable[..., Any], draft: Circuit, count: int
 ) -> tuple[Any, list[Any], dict[int, str]]:
     """Return the tape of a function, the measurements that it returns, and the line of each operator by its id.
 
-    A function of more inputs than `count` gets as many as it asks for.
+    It is called as `call`. A function of more inputs than `count` gets as many as it asks for.
     """
     import autoray  # type: ignore[import-untyped]
     import pennylane as qml
 
     autoray.register_backend(Angle, "numpy")
-    file = source.__code__.co_filename
+    name, file = inputs_of(function), source_of(function).__code__.co_filename
     lines: dict[int, str] = {}
 
     class Queue(qml.queuing.AnnotatedQueue):  # type: ignore[misc]  # PennyLane has no types
@@ -167,10 +178,10 @@ def _run(
             lines[id(obj)] = _line(file, traceback.walk_stack(None))
 
     failures: list[Exception] = []
-    for inputs in range(count, count + MORE_INPUTS):
+    for inputs in range(count, MOST_INPUTS + 1):
         try:
             with Queue() as queue:
-                result = call(np.array([draft.input(k) for k in range(inputs)], dtype=object), **weights)
+                result = call(**{name: np.array([draft.input(k) for k in range(inputs)], dtype=object)})
         except Exception as error:
             failures.append(error)
             if not _asks_for_more(error):
@@ -231,7 +242,7 @@ def _word(measurement: Any, name: str) -> dict[Any, str]:
     words = [dict(word) for word, factor in paulis.items() if word and factor == 1.0]
     if type(measurement).__name__ != "ExpectationMP" or len(words) != 1 or len(paulis) != 1:
         raise CircuitError(
-            f"'{name}' returns {measurement}: return expval of Z, X, Y or products of them, such as "
+            f"'{name}' returns {' '.join(str(measurement).split())}: return expval of Z, X, Y or products, such as "
             "qml.expval(qml.Z(0) @ qml.Z(1)); of a sum return the terms, and the layer behind the circuit weighs them"
         )
     return words[0]

@@ -16,7 +16,7 @@ import qrlsuite
 from qrlsuite import own
 from qrlsuite.circuit import ansatz, expectations
 from qrlsuite.circuit.tracing import trace
-from qrlsuite.errors import OptionError, PluginError
+from qrlsuite.errors import CircuitError, OptionError, PluginError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
 
 weight_shapes: dict[str, Any] = {}
@@ -224,6 +224,74 @@ def test_a_qnode_in_a_file_is_an_ansatz_of_its_own_size(tmp_path: Path) -> None:
         OptionError, match="layers = 2: the layers of 'swirl' are in the numbers of weight_shapes"
     ):
         ansatz("swirl", 2, 2)
+
+
+FORMS = """
+def embed(inputs, wires):
+    qml.AngleEmbedding(inputs, wires=wires)
+
+
+def block(inputs):
+    embed(inputs, ["a", "b", "c"])
+
+
+@qml.qnode(qml.device("default.qubit"))
+def behind(weights, inputs, **others):
+    embed(inputs, range(3))
+    return qml.expval(qml.Z(0))
+
+
+def bare(inputs, weights):
+    embed(inputs, range(3))
+    return qml.expval(qml.Z(0))
+
+
+def named(x, weights):
+    block(x)
+    return qml.expval(qml.Z("c"))
+
+
+wired = qml.QNode(named, qml.device("default.qubit", wires=["c", "b", "a"]))
+
+
+def make(count):
+    @qml.qnode(qml.device("default.qubit", wires=3))
+    def reads(inputs, weights):
+        for k in range(count):
+            qml.RX(inputs[k], wires=k % 3)
+        return qml.expval(qml.Z(0))
+
+    return reads
+
+
+reads = make(30)
+"""
+
+
+def test_each_way_to_write_a_quantum_function_and_its_helpers(tmp_path: Path) -> None:
+    file = plugin(tmp_path)
+    file.write_text(file.read_text() + FORMS)
+    own.load(file)
+    circuits = {name: ansatz(name, 3, 1) for name in ("behind", "bare", "reads")}
+    assert [(each.qubits, each.inputs) for each in circuits.values()] == [(3, 3), (3, 3), (3, 30)]
+    assert ansatz("named", 3, 1).inputs == 3
+    assert ansatz("named", 3, 1).observables == (0,)
+    for helper in ("embed", "block", "wired"):
+        with pytest.raises(UnknownNameError):
+            ansatz(helper, 3, 1)
+
+
+@pytest.mark.parametrize("given", [42, len, [1]])
+def test_a_layer_of_no_circuit(given: Any) -> None:
+    with pytest.raises(OptionError, match="give the name of an ansatz, a Circuit, or a QNode"):
+        qrlsuite.layer(given)
+
+
+@pytest.mark.parametrize("shape", ["(2, 3)", (0.5,), lambda a, b: (a, b)])
+def test_a_shape_that_is_none_says_how_one_is_written(shape: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "weight_shapes", {"weights": shape})
+    with pytest.raises(CircuitError, match=r"weight_shapes: 'weights': .*; write whole numbers, such as"):
+        trace(basic, 4, 1)
 
 
 @pytest.mark.parametrize(

@@ -283,9 +283,9 @@ def ring(qubits, layers, depth): ...\n => /bad.py:1: 'ring': parameter 'depth' n
 def ring(qubits, layers, d=None): ...\n => /bad.py:1: 'ring': parameter 'd' needs a type, for example d: int
 def ring(qubits, layers, d: 'Nothing' = 1): ...\n => 'ring': its annotations cannot be read: NameError
 def iqp(qubits, layers): ...\n => /bad.py:1: ansatz 'iqp' is registered already, by qrlsuite (
-import qrlsuite\nqrlsuite.register('x.py')\n => /bad.py:2: ''x.py'' cannot be registered: it is neither
-import qrlsuite\nqrlsuite.register(3)\n => /bad.py:2: '3' cannot be registered: it is neither a spec nor
-import qrlsuite\n@qrlsuite.register\nclass Net: pass\n => /bad.py:2: 'Net' cannot be registered: it is neither
+import qrlsuite\nqrlsuite.register('x.py')\n => /bad.py:2: ''x.py'' cannot be registered: write a
+import qrlsuite\nqrlsuite.register(3)\n => /bad.py:2: '3' cannot be registered: write a function
+import qrlsuite\n@qrlsuite.register\nclass Net: pass\n => /bad.py:2: 'Net' cannot be registered: write a
 from qrlsuite import hookimpl\n@hookimpl\ndef register_modles(register): ...\n => did you mean 'register_models'?
 """
 
