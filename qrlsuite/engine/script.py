@@ -141,7 +141,8 @@ class _Run:
         """Run the command to its end; report how far its curve is."""
         self.output.parent.mkdir(parents=True, exist_ok=True)
         began, pause = time.monotonic(), LOOK_SECONDS
-        with self.output.open("wb") as output, Interruptible() as guard:
+        self.output.unlink(missing_ok=True)  # a link in its place is not followed
+        with self.output.open("xb") as output, Interruptible() as guard:
             with guard.deferred():  # a command without a name is not stopped
                 process = _start(self.words, self.folder, output)
             try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 import glob
+import os
 import re
 import shlex
 import sys
@@ -91,9 +92,11 @@ class Script:
 
     def files(self, seed: int, folder: Path) -> list[Path]:
         """Return the files that a seed's pattern names now; `1` is not found in `10`."""
-        whole = fnmatch.translate(self._filled(self.curve, "\0")).replace("\0", rf"(?<!\d){seed}(?!\d)")
         names = glob.glob(self._filled(self.curve, seed), root_dir=folder, recursive=True)
-        return [folder / name for name in sorted(names) if re.fullmatch(whole, name)]
+        for part in (part for part in self.curve.split("/") if "{seed}" in part):
+            alone = fnmatch.translate(self._filled(part, "\0")).replace("\0", rf"(?<!\d){seed}(?!\d)")
+            names = [name for name in names if any(re.fullmatch(alone, word) for word in name.split("/"))]
+        return [folder / name for name in sorted(names)]
 
     @property
     def scores(self) -> str:
@@ -197,7 +200,8 @@ def _named(words: Sequence[str], folder: Path) -> Iterator[tuple[str, Path]]:
         for text in filter(None, texts):
             path = folder / text
             # a program that is no text is an interpreter, which the machine has, as it has packages
-            if path.is_file() and (before or path.suffix == ".py" or path.read_bytes()[:2] == b"#!"):
+            # (`Path.is_file` raises where a word is longer than a file's name can be)
+            if os.path.isfile(path) and (before or path.suffix == ".py" or path.read_bytes()[:2] == b"#!"):
                 yield text, path
 
 

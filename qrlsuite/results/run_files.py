@@ -12,6 +12,7 @@ import itertools
 import json
 import math
 import shlex
+import stat
 import zipfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -77,10 +78,12 @@ def holds_one_run(path: Path) -> bool:
                 or f"{path} holds no entry of this suite; to import curves that other programs wrote, name their "
                 f"files, such as {path}/*/*/evaluations.npz"
             )
-        size = path.stat().st_size
+        status = path.stat()
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
-    if size > MOST_BYTES and _kind(path) is not _tensorboard:  # which is read bit by bit
+    if not stat.S_ISREG(status.st_mode):
+        raise FileError(f"{path} cannot be read: not a regular file")
+    if status.st_size > MOST_BYTES and _kind(path) is not _tensorboard:  # which is read bit by bit
         raise FileError(f"{path}: larger than {MOST_BYTES // 10**6} MB")
     if _kind(path) is not None:
         return True

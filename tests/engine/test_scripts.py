@@ -201,6 +201,19 @@ def test_failures_say_what_to_do(walk: Path) -> None:
     assert not (walk / "pwned").exists()
 
 
+def test_a_long_word_is_no_file_and_a_link_is_not_written_through(walk: Path) -> None:
+    typed = [f"{word} {'x' * 300}" if "command=" in word else word for word in words(0, 1)]
+    assert commands.qrlsuite(*typed).returncode == 0
+    store, secret = the_entry(walk / "runs"), walk / "secret"
+    secret.write_text("mine")
+    shutil.rmtree(store.seed(0).path)
+    [output] = store.path.glob("groups/*/output.txt")
+    output.unlink()
+    output.symlink_to(secret)
+    assert commands.qrlsuite(*typed).returncode == 0
+    assert (store.seeds(), secret.read_text()) == ([0], "mine")
+
+
 def test_no_command_is_started_that_was_found_in_a_results_folder(walk: Path) -> None:
     entry = """
 [[entries]]
@@ -302,5 +315,7 @@ def test_a_pattern_finds_the_seed_alone_and_equal_steps_count_once(tmp_path: Pat
         (tmp_path / name).write_text("global_step,r\n5,1\n5,2\n9,3\n")
     script = scripts.build("x", {"command": "a {seed}", "curve": "*{seed}*.csv"})
     assert [path.name for path in script.files(1, tmp_path)] == ["seed-1.csv"]
+    below = scripts.build("x", {"command": "a {seed}", "curve": "**/seed-{seed}.csv"})
+    assert below.files(10, tmp_path) == [tmp_path / "seed-10.csv"]
     read = points.read_run([tmp_path / "seed-1.csv"], "r")
     assert np.column_stack([read.steps, read.scores]).tolist() == [[5, 2], [9, 3]]

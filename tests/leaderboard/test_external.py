@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -383,6 +384,9 @@ def test_huge_files_are_refused_before_they_are_read(tmp_path: Path, monkeypatch
         file.truncate(run_files.MOST_BYTES + 1)
     with pytest.raises(QrlSuiteError, match="larger than 1000 MB"):
         points.read_files([path])
+    os.mkfifo(tmp_path / "pipe.csv")  # to open it would take for ever
+    with pytest.raises(QrlSuiteError, match="pipe.csv cannot be read: not a regular file"):
+        points.read_files([tmp_path / "pipe.csv"])
     monkeypatch.setattr(points, "MOST_POINTS", 10)
     with pytest.raises(QrlSuiteError, match="more than 10 points"):
         points.read_files([write_csv(tmp_path / "a.csv", {"a": [[1.0] * 11]}, range(1, 12))])
