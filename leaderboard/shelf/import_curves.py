@@ -19,16 +19,17 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass
 
 from qrlsuite import notation, registry, specs
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import FileError, OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import task as tasks
-from qrlsuite.experiment.task import EXTERNAL, Task, TaskFile, digest
+from qrlsuite.experiment.task import EXTERNAL, Scale, Task, TaskFile, digest
 from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.import_seeds import Imported, unite
 from qrlsuite.options import parse_setting
@@ -46,7 +47,6 @@ from qrlsuite.results.store import (
 )
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.statistics.grid import Goal
 from qrlsuite.statistics.steps import LEAST_RUNS
 
 GRID_POINTS = 100
@@ -65,51 +65,47 @@ EARLY = {
 """Meanings of runs that end before the others of their entry."""
 
 
+@dataclass(frozen=True, kw_only=True, config={"extra": "forbid"})
+class Options(Scale):
+    """Options of an import, see `qrlsuite.import_curves`."""
+
+    early: Literal["solved", "failed", "cut"] | None = None
+    units: Literal["same"] | None = None
+
+
 def import_points(
-    points: Mapping[Run, Points],
-    runs: Path,
-    task: str | None = None,
-    maximum: float | None = None,
-    thresholds: Sequence[float] = (),
-    every: int | None = None,
-    goal: Goal | None = None,
-    metric: str | None = None,
-    early: str | None = None,
-    units: str | None = None,
+    points: Mapping[Run, Points], runs: Path, task: str | None, options: Options
 ) -> list[Imported]:
-    """Write curves to a results folder as the seeds of external entries; the options are those of `import_curves`.
+    """Write curves to a results folder as the seeds of external entries.
 
     Parameters
     ----------
     points:
         Steps and scores of each run.
     """
-    given = _require_options(maximum, thresholds, every, goal, early, units)
-    name = task or EXTERNAL
+    name, early = task or EXTERNAL, options.early
     known = _known_task(name, runs)
     held = entries(runs, known[2]) if known is not None and runs.is_dir() else []
     held = [store for store in held if store.record().imported is not None]
     scales = _scales(points)
-    _require_comparable(scales, known[0] if known else None, held, units)
-    step = known[0].protocol.interactions if known else every or _grid_of(points.values())
+    _require_comparable(scales, known[0] if known else None, held, options.units)
+    step = known[0].protocol.interactions if known else options.every or _grid_of(points.values())
     points = {run: replace(own, steps=_punctual(own.steps, step)) for run, own in points.items()}
     lengths = _lengths(points, step, early, held)
     instead = "another --task" if known else f"every={max(int(own.steps[0]) for own in points.values())}"
     curves = {run: _on_grid(own, step, lengths[run[0]], run, instead) for run, own in points.items()}
     if known is None:
-        _require_reachable(curves, given, goal == "below")
-        file = _new_task(name, step, curves, maximum, given, _score_of(goal, metric, maximum))
+        _require_reachable(curves, options.thresholds or [], options.goal == "below")
+        file = _new_task(name, step, curves, options)
         definition = Task(file, name).definition
     else:
         file, definition, name = known
-        _require_same_options(file, maximum, given, every)
-        if goal not in (None, file.score.goal):
-            raise OptionError(f"goal={goal}: task '{file.name}' has {file.score.goal}; leave it out")
+        _require_same_options(file, options)
     if early == "failed":
         worst = _worst(curves.values(), file)
         for run, own in points.items():
             curves[run][int(own.steps[-1]) // step :] = worst
-    best = file.score.max_return if maximum is None else maximum
+    best = options.maximum or file.score.max_return
     scores = {run: _scores(curve, best, file, run, points[run].source, step) for run, curve in curves.items()}
     by_entry: dict[str, dict[int, NDArray[np.float64]]] = defaultdict(dict)
     for (entry, seed), curve in sorted(scores.items()):
@@ -231,44 +227,6 @@ def _worst(curves: Iterable[NDArray[np.float64]], file: TaskFile) -> float:
     return float(scores.max() if file.score.goal == "below" else scores.min())
 
 
-def _score_of(goal: Goal | None, metric: str | None, maximum: float | None) -> dict[str, Any]:
-    """Return the section `[score]` of a new task."""
-    if goal != "below":
-        return {"source": "return", "max_return": maximum}
-    plain = re.sub(r"[^a-z0-9]+", "-", (metric or "score").lower()).strip("-")[:64].rstrip("-")
-    return {"metric": plain if specs.NAME.fullmatch(plain) else "score", "goal": "below"}
-
-
-def _require_options(
-    maximum: float | None,
-    thresholds: Sequence[float],
-    every: int | None,
-    goal: Goal | None,
-    early: str | None,
-    units: str | None,
-) -> list[float]:
-    """Return the thresholds, sorted."""
-    if maximum is not None and not (math.isfinite(maximum) and maximum > 0):
-        raise OptionError(f"maximum={maximum}: give the best possible score, a number above 0")
-    if goal not in (None, "above", "below"):
-        raise OptionError(f"goal={ascii(goal)[1:-1]}: write above, or below where less is better")
-    if goal == "below" and maximum is not None:
-        raise OptionError(
-            "goal=below: give thresholds=A,B,... in place of maximum, which is the best high score"
-        )
-    for name, value, words in (("early", early, tuple(EARLY)), ("units", units, ("same",))):
-        if value is not None and value not in words:
-            raise OptionError(f"{name}={ascii(value)[1:-1]}: write {' or '.join(words)}")
-    levels = sorted(float(level) for level in thresholds)
-    if not all(map(math.isfinite, levels)) or len(set(levels)) < len(levels):
-        raise OptionError(f"thresholds={','.join(f'{level:g}' for level in levels)}: give numbers, each once")
-    if maximum is not None and levels and not 0 < levels[0] <= levels[-1] <= maximum:
-        raise OptionError(f"thresholds: give scores above 0, up to maximum={maximum:g}")
-    if every is not None and every < 1:
-        raise OptionError(f"every={every}: give a number of environment steps, 1 or more")
-    return levels
-
-
 def _known_task(name: str, runs: Path) -> tuple[TaskFile, dict[str, Any], str] | None:
     """Return a task's file, its definition and its name: of the suite, or of an entry in the results folder."""
     if name.endswith(".toml") or name.startswith("gym:") or name in registry.load().of(specs.TaskSpec):
@@ -328,28 +286,22 @@ def _require_reachable(
         )
 
 
-def _new_task(
-    name: str,
-    every: int,
-    curves: Mapping[Run, NDArray[np.float64]],
-    maximum: float | None,
-    thresholds: list[float],
-    score: Mapping[str, Any],
-) -> TaskFile:
+def _new_task(name: str, every: int, curves: Mapping[Run, NDArray[np.float64]], scale: Scale) -> TaskFile:
     """Return the file of a task that these curves are the first of."""
     lengths: dict[str, list[int]] = defaultdict(list)
     for (entry, _), curve in curves.items():
         lengths[entry].append(len(curve))
     common = min(sorted(own, reverse=True)[(len(own) - 1) // 2] for own in lengths.values())
     epochs = max(map(len, curves.values()))
-    return tasks.external(name, every, epochs, maximum, thresholds, score, common)
+    return tasks.external(name, scale, every, epochs, common)
 
 
-def _require_same_options(
-    file: TaskFile, maximum: float | None, thresholds: list[float], every: int | None
-) -> None:
+def _require_same_options(file: TaskFile, scale: Scale) -> None:
     """Refuse options that contradict a task."""
+    maximum, thresholds, every = scale.maximum, scale.thresholds, scale.every
     step, ranking = file.protocol.interactions, file.ranking
+    if scale.goal not in (None, file.score.goal):
+        raise OptionError(f"goal={scale.goal}: task '{file.name}' has {file.score.goal}; leave it out")
     if every not in (None, step):
         raise OptionError(f"every={every}: task '{file.name}' has a grid of {step} steps; leave it out")
     best = file.score.max_return if file.environment.name == EXTERNAL else None
@@ -361,8 +313,8 @@ def _require_same_options(
         raise OptionError(
             f"maximum={maximum:g}: task '{file.name}' has thresholds on the score itself; leave it out"
         )
-    scale = 1.0 if ranking.epsilons is None else file.score.max_return or maximum or 1.0
-    own = sorted(scale * level for level in ranking.grid.thresholds)
+    unit = 1.0 if ranking.epsilons is None else file.score.max_return or maximum or 1.0
+    own = sorted(unit * level for level in ranking.grid.thresholds)
     if thresholds and not (len(own) == len(thresholds) and np.allclose(own, thresholds)):
         raise OptionError(
             f"thresholds: task '{file.name}' has {', '.join(f'{level:g}' for level in own)}; leave them out"

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
+from qrlsuite import options
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import import_curves as curve_files
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
@@ -98,6 +99,6 @@ def import_curves(
         found = points.read_files([Path(fspath(each)) for each in curves], metric)
     else:
         found = points.read_table(curves, metric)
-    return curve_files.import_points(
-        found, Path(runs), task, maximum, thresholds, every, goal, metric, early, units
-    )
+    given = {"metric": metric, "maximum": maximum, "thresholds": thresholds, "every": every, "goal": goal}
+    chosen = options.build(curve_files.Options, {**given, "early": early, "units": units}, "import")
+    return curve_files.import_points(found, Path(runs), task, chosen)

@@ -17,14 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError
 from qrlsuite.experiment import source, task
-from qrlsuite.experiment.task import EXTERNAL, Task
-from qrlsuite.statistics.grid import Goal
+from qrlsuite.experiment.task import EXTERNAL, Scale, Task
 
 SCRIPT = "script"
 """Name of the algorithm of entries that a command trains."""
@@ -36,13 +35,7 @@ POINTS = 100
 """Epochs of a run on a task that the suite does not know."""
 
 OF_TASKS = ("maximum", "thresholds", "every", "goal")
-"""Options that define a task that the suite does not know, as for `import`."""
-
-
-def _levels(value: Any) -> Any:
-    if isinstance(value, str):
-        return [float(word) for word in value.split(",")]
-    return [value] if isinstance(value, int | float) else value
+"""Options that define a task that the suite does not know."""
 
 
 def _of_a_seed(text: str) -> str:
@@ -55,9 +48,9 @@ def _of_a_seed(text: str) -> str:
 OfSeed = Annotated[str, AfterValidator(_of_a_seed), Field(max_length=10_000)]
 
 
-@dataclass(frozen=True, config={"extra": "forbid"})
-class Script:
-    """Options of a script's entry.
+@dataclass(frozen=True, kw_only=True, config={"extra": "forbid"})
+class Script(Scale):
+    """Options of a script's entry; those of `Scale` define a task that the suite does not know.
 
     Attributes
     ----------
@@ -67,8 +60,6 @@ class Script:
         Environment steps of a run; those of the task's protocol by default.
     curve:
         Pattern of the files with a run's curve: csv, or a file of `qrlsuite.results.run_files`.
-    metric:
-        The column or scalar that is the score.
     kind:
         What a score is, see `scores`.
     """
@@ -76,12 +67,7 @@ class Script:
     command: OfSeed
     steps: Annotated[int | None, Field(ge=1)] = None
     curve: OfSeed = "runs/*__{seed}__*/*tfevents*"
-    metric: str | None = None
     kind: Annotated[str | None, Field(pattern=specs.WHOLE_NAME, max_length=40)] = None
-    maximum: Annotated[float | None, Field(gt=0)] = None
-    thresholds: Annotated[list[float] | None, BeforeValidator(_levels)] = None
-    every: Annotated[int | None, Field(ge=1)] = None
-    goal: Goal | None = None
 
     def words(self, seed: int) -> list[str]:
         """Return the command's words for a seed."""
@@ -142,7 +128,10 @@ def place(name: str | Task, script: Script) -> tuple[Task, Script]:
     elif given and not (
         name.endswith(".toml") or name in registry.load().of(specs.TaskSpec) or task.is_quick(name)
     ):
-        found = _new_task(name, script)
+        if script.steps is None:
+            raise OptionError(f"task '{name}' is new: say how long a run is with steps=N")
+        every = script.every or max(1, script.steps // POINTS)
+        found = Task(task.external(name, script, every, script.steps // every), name)
     else:
         try:
             found = task.load(name)
@@ -158,18 +147,6 @@ def place(name: str | Task, script: Script) -> tuple[Task, Script]:
         raise OptionError(f"steps={steps}: not a whole number of {epoch}")
     kind = script.scores
     return found if kind == VALIDATION else found.with_scores(kind), replace(script, steps=steps)
-
-
-def _new_task(name: str, script: Script) -> Task:
-    """Return a task that a script's options define."""
-    if script.steps is None:
-        raise OptionError(f"task '{name}' is new: say how long a run is with steps=N")
-    every = script.every or max(1, script.steps // POINTS)
-    score: dict[str, Any] = {"source": "return", "max_return": script.maximum}
-    if script.goal == "below":
-        score = {"metric": "score", "goal": "below"}
-    levels = sorted(script.thresholds or [])
-    return Task(task.external(name, every, script.steps // every, script.maximum, levels, score), name)
 
 
 def code(name: str, script: Script, folder: Path) -> dict[str, Any]:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pydantic
 import pydantic.dataclasses
 from pydantic import (
+    AfterValidator,
+    BeforeValidator,
     Field,
+    FiniteFloat,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     model_serializer,
@@ -44,6 +49,49 @@ class Nothing:
 _EXTERNAL = specs.EnvironmentSpec(
     EXTERNAL, "An environment of another program", "qrlsuite.experiment.task:Nothing", ""
 )
+
+
+def _levels(value: Any) -> Any:
+    several = value.split(",") if isinstance(value, str) else value
+    return None if value is None else np.atleast_1d(several).tolist() or None
+
+
+@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config={"extra": "forbid"})
+class Scale:
+    """What a good score of another program is, and how far apart the points of its curves are.
+
+    Attributes
+    ----------
+    metric:
+        The column or scalar that is the score.
+    maximum:
+        The best possible score: scores become fractions of it.
+    thresholds:
+        Scores that count as reached, sorted; by default .6, .7, .8 and .9 of the maximum.
+    every:
+        Environment steps of an epoch.
+    goal:
+        `below` where less is better.
+    """
+
+    metric: str | None = None
+    maximum: Annotated[FiniteFloat | None, Field(gt=0)] = None
+    thresholds: Annotated[
+        Annotated[list[FiniteFloat], AfterValidator(sorted)] | None, BeforeValidator(_levels)
+    ] = None
+    every: Annotated[int | None, Field(ge=1)] = None
+    goal: Goal | None = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> Scale:
+        if self.goal == "below" and self.maximum is not None:
+            raise ValueError("goal=below: give thresholds=A,B,... in place of maximum, the best high score")
+        levels = self.thresholds or []
+        if len(set(levels)) < len(levels):
+            raise ValueError("thresholds: give each once")
+        if self.maximum is not None and levels and not 0 < levels[0] <= levels[-1] <= self.maximum:
+            raise ValueError(f"thresholds: give scores above 0, up to maximum={self.maximum:g}")
+        return self
 
 
 class EnvironmentSection(options.Table):
@@ -481,37 +529,28 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def external(
-    name: str,
-    every: int,
-    epochs: int,
-    maximum: float | None,
-    thresholds: Sequence[float],
-    score: Mapping[str, Any],
-    horizon: int | None = None,
-) -> TaskFile:
+def external(name: str, scale: Scale, every: int, epochs: int, horizon: int | None = None) -> TaskFile:
     """Return the file of a task whose environment only other programs know.
 
     Parameters
     ----------
     every, epochs:
         Environment steps of an epoch, and epochs of a run.
-    maximum:
-        The best possible score: scores become fractions of it.
-    thresholds:
-        Scores that count as reached, sorted; by default .6, .7, .8 and .9 of the maximum.
-    score:
-        The section `[score]`.
     horizon:
         Epochs at which entries are compared; None is all.
     """
+    maximum, thresholds = scale.maximum, scale.thresholds or []
     if maximum is None and not thresholds:
         raise OptionError(
             f"{name!a} is a new task: say what a good score is with maximum=BEST (the best possible), "
             "thresholds=A,B,... (scores that count as reached; with goal=below less is better), or --task TASK of the "
             "suite"
         )
-    hardest = 0 if score.get("goal") == "below" else -1
+    score: dict[str, Any] = {"source": "return", "max_return": maximum}
+    if scale.goal == "below":
+        plain = re.sub(r"[^a-z0-9]+", "-", (scale.metric or "score").lower()).strip("-")[:64].rstrip("-")
+        score = {"metric": plain if specs.NAME.fullmatch(plain) else "score", "goal": "below"}
+    hardest = 0 if scale.goal == "below" else -1
     ranking: dict[str, Any] = {
         "thresholds": [*thresholds],
         "reference": {"threshold": (thresholds or [0])[hardest]},
@@ -531,7 +570,7 @@ def external(
             "interactions": every,
             "validation_episodes": 1,
         },
-        "score": dict(score),
+        "score": score,
         "ranking": {
             **ranking,
             "reference": {**ranking["reference"], "delta": _DELTA},

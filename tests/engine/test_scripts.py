@@ -285,6 +285,8 @@ def test_scores_of_another_kind_are_another_task() -> None:
     assert task_of(kind="validation") == "cartpole"
     with pytest.raises(OptionError, match="says that itself"):
         task_of(maximum="500")
+    with pytest.raises(OptionError, match="in place of maximum"):
+        task_of(maximum="500", goal="below")
 
 
 def test_what_a_command_names_and_imports_is_its_code(tmp_path: Path) -> None:

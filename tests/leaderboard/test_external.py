@@ -112,7 +112,7 @@ def test_runs_that_end_early_are_what_the_user_says(tmp_path: Path) -> None:
     assert record.imported["early"] == "failed"
     with pytest.raises(QrlSuiteError, match=r"a run of 'a' ends at step 20, .*: type every=20"):
         api.import_curves(ending(path, 30, 20), thresholds=[15], every=40, runs=tmp_path)
-    with pytest.raises(OptionError, match="early=died: write solved or failed or cut"):
+    with pytest.raises(OptionError, match="early = 'died': Input should be 'solved', 'failed' or 'cut'"):
         take("died")
 
 
@@ -366,12 +366,12 @@ def test_a_copy_of_a_seed_that_was_imported_before_is_refused(tmp_path: Path) ->
 def test_what_a_good_score_is_has_to_be_said(csv: Path, tmp_path: Path) -> None:
     for options, message in (
         ({}, "'external' is a new task: say what a good score is with maximum"),
-        ({"maximum": -1.0}, "maximum=-1.0: give the best possible score"),
+        ({"maximum": -1.0}, "maximum = -1.0: Input should be greater than 0"),
         ({"maximum": 10.0, "thresholds": [20]}, "up to maximum=10"),
-        ({"thresholds": [20, 20]}, "give numbers, each once"),
+        ({"thresholds": [20, 20]}, "give each once"),
         ({"maximum": 100.0, "thresholds": [0.1, 0.2]}, "every run is above them .* which lie between"),
         ({"maximum": 100.0, "task": "../up"}, "--task ../up: name"),
-        ({"maximum": 100.0, "every": 0}, "every=0"),
+        ({"maximum": 100.0, "every": 0}, "every = 0"),
     ):
         with pytest.raises(QrlSuiteError, match=message):
             api.import_curves(csv, runs=tmp_path / "runs", **options)
@@ -385,7 +385,7 @@ def test_huge_files_are_refused_before_they_are_read(tmp_path: Path, monkeypatch
     with pytest.raises(QrlSuiteError, match="larger than 1000 MB"):
         points.read_files([path])
     os.mkfifo(tmp_path / "pipe.csv")  # to open it would take for ever
-    with pytest.raises(QrlSuiteError, match="pipe.csv cannot be read: not a regular file"):
+    with pytest.raises(QrlSuiteError, match=r"pipe\.csv cannot be read: not a regular file"):
         points.read_files([tmp_path / "pipe.csv"])
     monkeypatch.setattr(points, "MOST_POINTS", 10)
     with pytest.raises(QrlSuiteError, match="more than 10 points"):
@@ -545,7 +545,7 @@ def test_files_and_folders_are_told_apart(qrlsuite: Callable[..., Any], csv: Pat
         (("empty", "maximum=3"), "maximum is for files with curves"),
         (("notes.txt",), "give a csv file with the columns entry,seed,step,score"),
         (("none.csv",), "none.csv cannot be read: No such file or directory"),
-        ((csv, "thresholds=high"), "thresholds=high: write numbers"),
+        ((csv, "thresholds=high"), "thresholds.0 = 'high': Input should be a valid number"),
     ):
         assert message in refused("import", *words), words
 

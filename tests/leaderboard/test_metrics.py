@@ -221,7 +221,7 @@ def test_curves_of_other_programs_may_be_costs(tmp_path: Path) -> None:
     assert [row.entry.label for row in section.times.rows] == ["external a", "external b"]
     for more, problem in (
         ({"maximum": 12.0}, "in place of maximum"),
-        ({"goal": "down"}, "goal=down: write above"),
+        ({"goal": "down"}, "goal = 'down': Input should be 'above' or 'below'"),
         ({"thresholds": [20, 30], "task": "new"}, "every run is below them from its first"),
         ({"goal": "above"}, "has below; leave it out"),
     ):

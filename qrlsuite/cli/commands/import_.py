@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +16,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.experiment.task import EXTERNAL
 from qrlsuite.leaderboard.shelf import import_curves, import_seeds, published_studies
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
+from qrlsuite.options import field_names
 from qrlsuite.results import run_files
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import entries
@@ -101,35 +102,8 @@ def _taken(folder: Path, runs: Path) -> Iterator[Imported]:
 
 def divide(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     """Divide words into names and options; a path or an entry may have a `=` in it, too."""
-    options: dict[str, Any] = {}
-    names = []
-    for word in words:
-        name, equals, text = word.partition("=")
-        if equals and name in OPTIONS:
-            options[name] = _value(word, text, OPTIONS[name])
-        else:
-            names.append(word)
-    return names, options
-
-
-def _value(word: str, text: str, kind: Callable[[str], Any]) -> Any:
-    try:
-        return kind(text)
-    except ValueError:
-        raise OptionError(f"{word}: write {'numbers' if kind is _numbers else 'a number'}") from None
-
-
-def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.split(",")]
-
-
-OPTIONS: dict[str, Callable[[str], Any]] = {
-    "maximum": float,
-    "thresholds": _numbers,
-    "every": int,
-    "metric": str,
-    "goal": str,
-    "early": str,
-    "units": str,
-}
-"""Options of files, by name, and how they are read."""
+    pairs = {word: word.partition("=") for word in words}
+    given = [
+        word for word, pair in pairs.items() if pair[1] and pair[0] in field_names(import_curves.Options)
+    ]
+    return [word for word in words if word not in given], {pairs[word][0]: pairs[word][2] for word in given}
