@@ -54,9 +54,10 @@ def add(store: EntryStore, seeds: Iterable[int], epochs: int = 0, **more: str) -
 
 
 def take_over(store: EntryStore, asked: Mapping[int, int], withdrawn: Mapping[int, str]) -> None:
-    """Record what `read` returned of another folder with seeds of the entry."""
+    """Record what `read` returned of another folder with seeds of the entry; no seed that is here is withdrawn."""
+    here = store.seeds()
     for reason in dict.fromkeys(withdrawn.values()):
-        add(store, [seed for seed, why in withdrawn.items() if why == reason], withdrawn=reason)
+        add(store, [s for s, why in withdrawn.items() if why == reason and s not in here], withdrawn=reason)
     for epochs in dict.fromkeys(asked.values()):
         add(store, [seed for seed, most in asked.items() if most == epochs], epochs)
 
@@ -68,7 +69,7 @@ def missing_text(store: EntryStore, missing: Sequence[int], total: int) -> str:
     told = ", ".join(map(str, lost)) if len(lost) <= 10 else format_seeds(lost)
     parts = {"still training": len(missing) - len(lost), f"missing: {told}": len(lost)}
     return "; ".join(
-        f"{count} of {counted(total, 'seed')} {'is' if count == 1 else 'are'} {what}"
+        f"{count:,} of {counted(total, 'seed')} {'is' if count == 1 else 'are'} {what}"
         for what, count in parts.items()
         if count
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import shutil
@@ -376,17 +377,18 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
     return size
 
 
-def withdraw(store: EntryStore, seeds: Sequence[int], reason: str) -> int:
+def withdraw(stores: Sequence[EntryStore], seeds: Sequence[int], reason: str) -> int:
     """Record why seeds, there or not, are no longer asked for, and delete them; returns the bytes freed."""
-    asked, _ = requests.read(store)
-    if unknown := sorted(set(seeds) - {*asked, *store.seeds()}):
-        raise OptionError(f"--seeds: {store.path} has no seeds {format_seeds(unknown)}, missing or not")
-    folders, claim = [store.seed(seed).path for seed in seeds], acquire(store, seeds)
-    freed = sum(_usage(folder)[0] for folder in folders)
-    try:
-        requests.add(store, seeds, withdrawn=reason)
-        for folder in folders:
-            shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        claim.release()
+    for store in stores:
+        if unknown := sorted(set(seeds) - {*requests.read(store)[0], *store.seeds()}):
+            raise OptionError(f"--seeds: {store.path} has no seeds {format_seeds(unknown)}, missing or not")
+    freed = 0
+    with contextlib.ExitStack() as claims:
+        for store in stores:
+            claims.callback(acquire(store, seeds).release)
+        for store in stores:
+            requests.add(store, seeds, withdrawn=reason)
+            for folder in (store.seed(seed).path for seed in seeds):
+                freed += _usage(folder)[0]
+                shutil.rmtree(folder, ignore_errors=True)
     return freed

@@ -188,11 +188,8 @@ class Study:
         for folder in (self.runs, self.runs / TUNING, *(path for path in studies if path != self.folder)):
             for name, entry in self.entries.items():
                 path = folder / entry.task.name / entry.name
-                if (
-                    seeds := [seed for seed in EntryStore(path).seeds() if seed in own]
-                    if path.is_dir()
-                    else []
-                ):
+                trained = EntryStore(path).seeds() if path.is_dir() else []
+                if seeds := [seed for seed in trained if seed in own]:
                     yield f"seeds {format_seeds(seeds)} of '{name}' were trained already ({path})"
         for log in (path / LOG for path in studies if (path / LOG).is_file()):
             file, lines = log.with_name(FILE), read_records(log, LookLine)

@@ -91,6 +91,11 @@ def test_a_withdrawn_request_is_named_with_its_reason(runs: Path, tmp_path: Path
             say(*rm, text)
     with pytest.raises(OptionError, match="has no seeds 24:25"):
         say(*rm, "24:25 reason=x")
+    with pytest.raises(OptionError, match="--seeds 6: write 6:7 for this seed, 0:6 for so many"):
+        say(*rm, "6 reason=x")
+    (lose(runs, 16, 6).path / requests.FILE).unlink()
+    with pytest.raises(OptionError, match="has no seeds 6:7, missing or not"):
+        say(*rm[:3], "mlp width=16", *rm[3:], "6:8 reason=x")
     assert requests.read(store)[0].keys() == {*range(24)}
     say(*rm, "6,7 reason='the disk failed'")
     entry = api.load("mlp width=8", runs=runs)
@@ -104,6 +109,10 @@ def test_a_withdrawn_request_is_named_with_its_reason(runs: Path, tmp_path: Path
     assert published.read(folder).entry_results().withdrawn == {6: "the disk failed", 7: "the disk failed"}
     say("import", str(folder), "--runs", str(tmp_path / "other"))
     assert api.load("mlp width=8", runs=tmp_path / "other").withdrawn == entry.withdrawn
+    whole = tmp_path / "whole"
+    shutil.copytree(Path("runs"), whole)
+    say("import", str(runs), "--runs", str(whole))
+    assert not api.load("mlp width=8", runs=whole).withdrawn, "its seeds are there"
     api.train("tiny.toml", "mlp width=8", seeds=24, runs=runs, workers=1, progress=False)
     assert (api.load("mlp width=8", runs=runs).withdrawn, len(api.load("mlp width=8", runs=runs).seeds)) == (
         {},

@@ -158,7 +158,7 @@ def delete_entries(
     if withdrawn is None:
         freed = delete_each(runs, chosen)
     else:
-        freed = sum(withdraw(EntryStore(entry.folder), *withdrawn) for entry in chosen)
+        freed = withdraw([EntryStore(entry.folder) for entry in chosen], *withdrawn)
     if json_output:
         rows = [{"task": entry.task, "entry": entry.name, "size": entry.size} for entry in chosen]
         typer.echo(json.dumps({"deleted": rows, "freed": freed}))
@@ -173,6 +173,10 @@ def _withdrawn(text: str) -> tuple[list[int], str]:
     if set(more) - {"reason"} or not reason or not reason.isprintable() or len(reason) > 300:
         example = "--seeds \"6,18 reason='the disk failed'\""
         raise OptionError(f"--seeds {text}: give a reason, in one line, for example {example}")
+    if seeds.isdecimal():  # elsewhere it is the first so many
+        raise OptionError(
+            f"--seeds {seeds}: write {seeds}:{int(seeds) + 1} for this seed, 0:{seeds} for so many"
+        )
     return parse_seeds(seeds), reason
 
 
