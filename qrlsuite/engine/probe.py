@@ -31,7 +31,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +48,7 @@ from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
 from qrlsuite.results.records import EntryRecord, EpochLine, ProbeRecord, Provenance
-from qrlsuite.results.store import EntryStore, SeedStore, read_arrays
+from qrlsuite.results.store import EntryStore, SeedStore, flatten, read_arrays
 
 if TYPE_CHECKING:
     from qrlsuite.training.group import Part
@@ -138,9 +138,12 @@ def _different(first: Arrays, second: Arrays) -> str:
 
 def difference(together: Side, alone: Side) -> str:
     """Name the first difference; empty if there is none."""
-    for number, (line, other) in enumerate(zip(together.lines, alone.lines), start=1):
-        for name in line:
-            if line[name] != other.get(name):
+    for number, lines in enumerate(zip(together.lines, alone.lines), start=1):
+        line, other = map(
+            flatten, lines
+        )  # rows of a table nest values, and have None where an epoch has none
+        for name in {**line, **other}:
+            if line.get(name) != other.get(name):
                 return f"'{name}' of epoch {number}"
     if len(together.lines) != len(alone.lines):
         return "the epoch in which it first learns"
@@ -243,10 +246,11 @@ def in_fresh_process(
     return Side(header["lines"], arrays, header["changed"], header["again"]), header["cpu"]
 
 
+@dataclass
 class Probe:
     """The probe of a group of seeds, made while it is trained.
 
-    Parameters
+    Attributes
     ----------
     entry, seed:
         The middle one of the group.
@@ -260,23 +264,16 @@ class Probe:
         Whether the code was probed before.
     """
 
-    def __init__(
-        self,
-        entry: Entry,
-        seed: int,
-        epochs: int,
-        device: str,
-        claim: Claim,
-        start: Path | None = None,
-        recorded: SeedStore | None = None,
-        made: bool = False,
-    ) -> None:
-        self.start, self.recorded = start, recorded
-        self.entry, self.seed, self.device, self.claim = entry, seed, device, claim
-        self.epochs = min(epochs, MOST_EPOCHS)
-        self._recorder: Recorder | None = None
-        self._alone = False
-        self._made = made
+    entry: Entry
+    seed: int
+    epochs: int
+    device: str
+    claim: Claim
+    start: Path | None
+    recorded: SeedStore | None
+    made: bool
+    _recorder: Recorder | None = field(default=None, init=False)
+    _alone: bool = field(default=False, init=False)
 
     def require_unchanged(self, trainer: Trainer) -> str:
         """Refuse to train on where the seed's first epoch is not its record; return why they were not compared."""
@@ -284,10 +281,8 @@ class Probe:
             return ""
         if not (lines := self.recorded.epochs()):
             return ""
-        here, skipped = (
-            provenance.of(self.entry, trainer.device),
-            f"seed {self.seed} was not compared with its record: ",
-        )
+        here = provenance.of(self.entry, trainer.device)
+        skipped = f"seed {self.seed} was not compared with its record: "
         there = record.provenance[0] if record.provenance else Provenance()
         if elsewhere := provenance.difference(here, there):
             return f"{skipped}{elsewhere}"
@@ -312,18 +307,18 @@ class Probe:
         """Look at a training before its first epoch; returns whether `judge` can be called."""
         if trainer.epoch == 0 and trainer.S != 2:
             self._recorder, self._alone = Recorder(trainer), trainer.S == 1
-        return self._recorder is None and not self._made
+        return self._recorder is None and not self.made
 
     def add(self, trainer: Trainer, lines: Sequence[EpochLine], state: Arrays) -> bool:
         """Add an epoch; returns whether `judge` can be called."""
-        if self._made or self._recorder is None:
+        if self.made or self._recorder is None:
             return False
         changed = self._recorder.add(trainer, lines, state)
         return changed or len(self._recorder.side.lines) >= self.epochs
 
     def judge(self) -> ProbeRecord:
         """Train the missing sides in fresh processes, and compare; return the value of `probe` in `run.json`."""
-        self._made = True
+        self.made = True
         began = time.monotonic()
         facts: dict[str, Any] = {
             "seed": self.seed,
@@ -403,7 +398,7 @@ def prepare(parts: Sequence[Part], epochs: int, device: str) -> Probe | None:
         return None
     start = None if entry.start is None else store.start_of(seed).absolute()
     recorded = store.seed(seed) if seed in store.seeds() else None
-    return Probe(entry, seed, epochs, device, claim, start, recorded, bool(made))
+    return Probe(entry, seed, min(epochs, MOST_EPOCHS), device, claim, start, recorded, bool(made))
 
 
 def _end(*given: object) -> None:

@@ -576,7 +576,7 @@ def table_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pyarrow.Table:
     """Return epoch records as columns, which `table_bytes` encodes."""
-    flat = [_flatten(row) for row in rows]
+    flat = [flatten(row) for row in rows]
     columns = {
         name: [row.get(name) for row in flat] for name in sorted({name for row in flat for name in row})
     }
@@ -589,7 +589,8 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pyarrow.Table:
     )
 
 
-def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
+def flatten(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an epoch's record with nested values under names of their own, as a table has them."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):
@@ -627,7 +628,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Undo `_flatten`."""
+    """Undo `flatten`."""
     row: dict[str, Any] = {}
     for name, value in flat.items():
         outer, dot, inner = name.partition(".")

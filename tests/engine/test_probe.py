@@ -16,7 +16,8 @@ import pytest
 from qrlsuite.engine import probe
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.records import EpochLine
+from qrlsuite.results.store import EntryStore, read_table, table_bytes
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, install, installed, results
 
@@ -150,6 +151,16 @@ def test_what_changed_since_is_seen_and_nothing_is_lost(seeds: str, acme: Acme) 
     acme.run("changing", seeds, "--epochs", "4")
     for seed in range(int(seeds)):
         assert results(acme.entry(), seed) == results(acme.entry("straight"), seed)
+
+
+def test_a_table_says_the_same_as_lines(tmp_path: Path) -> None:
+    first = {"epoch": 1, "scores": [0.5], "loss": None, "executions": {"a": 1}, "measured.regret": 3.0}
+    lines = [first, {**first, "epoch": 2, "executions": {"a": 1, "b": 2}, "diverged": True}]
+    (tmp_path / "table").write_bytes(table_bytes(lines))
+    rows = [EpochLine.read(row, tmp_path).content for row in read_table(tmp_path / "table")]
+    assert probe.difference(probe.Side(rows, {}), probe.Side(lines, {})) == ""
+    other = [{**first, "executions": {"a": 1, "b": 1}}, lines[1]]
+    assert probe.difference(probe.Side(rows, {}), probe.Side(other, {})) == "'executions.b' of epoch 1"
 
 
 def test_with_other_versions_nothing_is_compared_and_that_is_said(acme: Acme) -> None:
