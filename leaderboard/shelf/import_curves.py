@@ -43,10 +43,10 @@ from qrlsuite.results.store import (
     EntryStore,
     SeedStore,
     entries,
-    round_means,
 )
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.statistics.grid import settled
 from qrlsuite.statistics.steps import LEAST_RUNS
 
 GRID_POINTS = 100
@@ -116,9 +116,7 @@ def import_points(
         told = {"grid": grid, "maximum": best, **scales[entry].content}
         record = _record(entry, name, file, definition, told)
         stores[entry] = EntryStore(runs / name / record.name), record
-        _require_no_copies(
-            entry, {seed: curves[entry, seed] for seed in of_seeds}, of_seeds, stores[entry][0]
-        )
+        _require_no_copies(entry, of_seeds, stores[entry][0])
     return [_write(entry, of_seeds, *stores[entry], points, early) for entry, of_seeds in by_entry.items()]
 
 
@@ -325,7 +323,7 @@ def _scores(
     curve: NDArray[np.float64], best: float | None, file: TaskFile, run: Run, source: str, every: int
 ) -> NDArray[np.float64]:
     """Return scores in the unit of a task: fractions of the best one where there is one."""
-    scores = round_means(curve if best is None or file.ranking.thresholds is not None else curve / best)
+    scores = settled(curve if best is None or file.ranking.thresholds is not None else curve / best)
     try:
         require_scores(scores, file, Path(source))
     except StoreError:
@@ -345,25 +343,19 @@ def _scores(
     return scores
 
 
-def _require_no_copies(
-    entry: str,
-    curves: Mapping[int, NDArray[np.float64]],
-    scores: Mapping[int, NDArray[np.float64]],
-    store: EntryStore,
-) -> None:
-    """Refuse two seeds with one curve. Curves of one or two values are allowed: runs that learn nothing share them.
+def _require_no_copies(entry: str, curves: Mapping[int, NDArray[np.float64]], store: EntryStore) -> None:
+    """Refuse two seeds with one curve, also of imports before.
 
-    Curves that were imported before count, too; they are stored as scores, in the unit of the task.
+    Curves of one or two values are allowed: runs that learn nothing share them.
     """
-    before: dict[bytes, int] = {}
+    first: dict[bytes, int] = {}
     for seed in store.seeds() if store.path.is_dir() else []:
         with contextlib.suppress(StoreError):  # a damaged seed is said where it is read
             run = store.seed(seed).read()
             if seed not in curves and len(run.scores):
-                before[run.curve.tobytes()] = seed
-    first: dict[bytes, int] = {}
+                first[run.curve.tobytes()] = seed
     for seed, curve in curves.items():
-        other = before.get(scores[seed].tobytes(), first.setdefault(curve.tobytes(), seed))
+        other = first.setdefault(curve.tobytes(), seed)
         if other != seed and len(np.unique(curve)) > 2:
             raise FileError(
                 f"seeds {other} and {seed} of '{entry}' have the same curve: no two runs learn the same by chance; "

@@ -50,9 +50,9 @@ from qrlsuite.results.store import (
     SeedStore,
     read_arrays,
     require_finite,
-    round_means,
 )
 from qrlsuite.specs import NAME, AlgorithmSpec, EnvironmentSpec, ModelSpec
+from qrlsuite.statistics.grid import settled
 
 PUBLISHED = Path(__file__).parents[1] / "entries"
 """The entries that come with the suite and stand on its boards."""
@@ -462,7 +462,7 @@ def _curves(
             f"seed {seed} has {count} of {length} epochs: some are missing",
         )
     require_scores(scores, task_file, folder)
-    curves = round_means(scores[order].reshape(len(seeds), length))
+    curves = settled(scores[order].reshape(len(seeds), length))
     _refuse_copies(folder, seeds.tolist(), curves)
     measured = {
         name: np.array(table[f"{MEASURED}.{name}"], np.float64)[order].reshape(curves.shape)

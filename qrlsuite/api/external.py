@@ -93,12 +93,12 @@ def import_curves(
         found = points.read_arrays(curves, steps)
     elif steps is not None:
         raise OptionError("steps: files and tables have steps of their own; leave it out")
-    elif isinstance(curves, str | PathLike):
-        found = points.read_files([Path(fspath(curves))], metric)
-    elif isinstance(curves, Sequence) and all(isinstance(each, str | PathLike) for each in curves):
-        found = points.read_files([Path(fspath(each)) for each in curves], metric)
     else:
-        found = points.read_table(curves, metric)
+        paths = [curves] if isinstance(curves, str | PathLike) else curves
+        if isinstance(paths, Sequence) and all(isinstance(each, str | PathLike) for each in paths):
+            found = points.read_files([Path(fspath(each)) for each in paths], metric)
+        else:
+            found = points.read_table(curves, metric)
     given = {"metric": metric, "maximum": maximum, "thresholds": thresholds, "every": every, "goal": goal}
     chosen = options.build(curve_files.Options, {**given, "early": early, "units": units}, "import")
     return curve_files.import_points(found, Path(runs), task, chosen)

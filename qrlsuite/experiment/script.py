@@ -7,11 +7,11 @@ in this call, or stands in the study file that this call names. An entry that is
 from __future__ import annotations
 
 import fnmatch
+import functools
 import glob
 import os
 import re
 import shlex
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -184,11 +184,7 @@ def _named(words: Sequence[str], folder: Path) -> Iterator[tuple[str, Path]]:
 
 def _imported(module: str, root: Path) -> dict[str, str]:
     """Return the SHA-256 of the files below a folder that a module imports, by path; nothing is executed."""
-    sys.path.insert(0, str(root))
-    try:
-        found = source.reached([module], lambda name, spec: Path(spec.origin or "").is_relative_to(root))
-    finally:
-        sys.path.remove(str(root))
+    found = source.reached([module], None, functools.partial(source.below, root))
     packages = {parent / "__init__.py" for file in found for parent in Path(file).parents if parent != Path()}
     here = [file for file in packages if (root / file).is_file()]
     return found | {file.as_posix(): source.digest(file.name, (root / file).read_bytes()) for file in here}

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib.machinery
+import importlib.util
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from typing import Any
 
 _APART = re.compile(
@@ -94,39 +98,7 @@ def _written(value: object) -> str:
     return f"{type(value).__name__}:{value!a};"
 
 
-def reached(roots: Iterable[str], belongs: Callable[[str, ModuleSpec], bool]) -> dict[str, str]:
-    """Return the SHA-256 of every module that the roots reach by imports, by file.
-
-    An import of a name from a package counts for the module of that name, else for the package's own `__init__`; the
-    packages above a module do not count. A module without source counts by its file's bytes, one without a file not at
-    all. Nothing is imported.
-
-    Parameters
-    ----------
-    roots:
-        Names of modules.
-    belongs:
-        Whether a module counts, by the name and the spec of its top-level package.
-    """
-    found: dict[str, str] = {}
-    seen: set[str] = set()
-    left = list(roots)
-    while left:
-        name = left.pop()
-        if name in seen:
-            continue
-        seen.add(name)
-        top = find(name.partition(".")[0])
-        if top is None or not belongs(name.partition(".")[0], top):
-            continue
-        spec = find(name)
-        content = None if spec is None else _content(spec)
-        if spec is None or content is None:
-            continue
-        digest, imported = _read(content, spec)
-        found[_file(spec)] = digest
-        left += imported
-    return dict(sorted(found.items()))
+Find = Callable[[str], ModuleSpec | None]
 
 
 def find(name: str) -> ModuleSpec | None:
@@ -156,6 +128,55 @@ def find(name: str) -> ModuleSpec | None:
     return None
 
 
+def below(folder: Path, name: str) -> ModuleSpec | None:
+    """Return where a module of a script is, whatever this process has imported; packages may lack an `__init__.py`."""
+    place = str(folder / name.replace(".", "/"))
+    for file in (
+        f"{place}/__init__.py",
+        *(f"{place}{suffix}" for suffix in importlib.machinery.all_suffixes()),
+    ):
+        if os.path.isfile(file):
+            return importlib.util.spec_from_file_location(name, file)
+    return None
+
+
+def reached(
+    roots: Iterable[str], belongs: Callable[[str, ModuleSpec], bool] | None, find: Find = find
+) -> dict[str, str]:
+    """Return the SHA-256 of every module that the roots reach by imports, by file.
+
+    An import of a name from a package counts for the module of that name, else for the package's own `__init__`; the
+    packages above a module do not count. A module without source counts by its file's bytes, one without a file not at
+    all. Nothing is imported.
+
+    Parameters
+    ----------
+    roots:
+        Names of modules.
+    belongs:
+        Whether a module counts, by the name and the spec of its top-level package; None if each that is found does.
+    """
+    found: dict[str, str] = {}
+    seen: set[str] = set()
+    left = list(roots)
+    while left:
+        name = left.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        first = name.partition(".")[0]
+        if belongs is not None and ((top := find(first)) is None or not belongs(first, top)):
+            continue
+        spec = find(name)
+        content = None if spec is None else _content(spec)
+        if spec is None or content is None:
+            continue
+        digest, imported = _read(content, spec, find)
+        found[_file(spec)] = digest
+        left += imported
+    return dict(sorted(found.items()))
+
+
 def _content(spec: ModuleSpec) -> bytes | None:
     """Return the bytes of a module's file; None where it has none."""
     if not spec.has_location or spec.origin is None:
@@ -174,10 +195,10 @@ def _file(spec: ModuleSpec) -> str:
     return f"{place}/__init__{suffix}" if spec.submodule_search_locations is not None else place + suffix
 
 
-def _read(content: bytes, spec: ModuleSpec) -> tuple[str, list[str]]:
+def _read(content: bytes, spec: ModuleSpec, find: Find) -> tuple[str, list[str]]:
     """Return a module's SHA-256, and the names of the modules that it imports anywhere."""
     tree = _tree(content, str(spec.origin))
-    return _digest(content, tree), [] if tree is None else list(_imports(tree, spec))
+    return _digest(content, tree), [] if tree is None else list(_imports(tree, spec, find))
 
 
 def _tree(content: bytes, name: str) -> ast.Module | None:
@@ -201,7 +222,7 @@ def digest(name: str, content: bytes) -> str:
     return _digest(content, _tree(content, name))
 
 
-def _imports(tree: ast.Module, spec: ModuleSpec) -> Iterator[str]:
+def _imports(tree: ast.Module, spec: ModuleSpec, find: Find) -> Iterator[str]:
     package = spec.submodule_search_locations is not None
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -24,7 +24,7 @@ from qrlsuite.errors import FileError, OptionError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import run_files
 from qrlsuite.results.genuine import require_plain
-from qrlsuite.results.run_files import MOST_POINTS, cells_of, lines_of, whole
+from qrlsuite.results.run_files import MOST_POINTS, table_of, whole
 
 COLUMNS = ("entry", "seed", "step", "score")
 """Columns of a csv file or a table."""
@@ -189,9 +189,7 @@ def _curve_of(paths: Sequence[Path], metric: str | None) -> tuple[str, run_files
         return name, dict(curve).items()
     if len(paths) > 1:
         raise FileError(f"{paths[0]} and {paths[1]} are of one run by their paths: name one of them")
-    content = cells_of(paths[0], lines_of(paths[0]))
-    _, head = next(content, (0, list[str]()))
-    names = [each.strip() for each in head]
+    names, content = table_of(paths[0])
     columns = _columns(names, metric, str(paths[0]), COLUMNS[2:])
     (time, value), at = map(names.index, columns), dict[int, float]()
     for line, cells in content:
@@ -206,16 +204,13 @@ def _curve_of(paths: Sequence[Path], metric: str | None) -> tuple[str, run_files
 
 def _names_no_run(path: Path) -> bool:
     """Return whether a csv file has steps, and no column of entries or seeds: its path names its run."""
-    _, head = next(cells_of(path, lines_of(path)), (0, list[str]()))
-    names = [name.strip() for name in head]
+    names, _ = table_of(path)
     named = _column("entry", names) or _column("seed", names) or _charts(names, None)
     return bool(_column("step", names)) and not named
 
 
 def _read_csv(path: Path, rows: _Rows, metric: str | None) -> None:
-    content = cells_of(path, lines_of(path))
-    _, head = next(content, (0, list[str]()))
-    names = [name.strip() for name in head]
+    names, content = table_of(path)
     wide = _charts(names, metric)
     wanted = _columns(names, metric, str(path)) if not wide else [_column("step", names)[0]]
     places = [names.index(name) for name in wanted]

@@ -161,8 +161,17 @@ def lines_of(path: Path) -> Iterator[str]:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
-def cells_of(path: Path, lines: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells of every line of a csv file that is not empty."""
+def table_of(
+    path: Path, lines: Iterable[str] | None = None
+) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
+    """Return the names in the first line of a csv file, and the number and the cells of each further one."""
+    content = _cells_of(path, lines_of(path) if lines is None else lines)
+    _, names = next(content, (0, list[str]()))
+    return [name.strip() for name in names], content
+
+
+def _cells_of(path: Path, lines: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells of every line that is not empty."""
     reader = csv.reader(lines)
     try:
         for cells in reader:
@@ -195,8 +204,7 @@ def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
         started = float(json.loads(next(lines, "").removeprefix("#"))["t_start"])
     except (ValueError, TypeError, KeyError, RecursionError):
         raise FileError(f'{path}: a monitor file begins with #{{"t_start": ...}}') from None
-    content = cells_of(path, lines)
-    _, names = next(content, (0, list[str]()))
+    names, content = table_of(path, lines)
     if not {"r", "l", "t"} <= set(names):
         raise FileError(
             f"{path}: expected the columns r, l, t; found {listed([ascii(n)[1:-1] for n in names]) or 'none'}"
@@ -218,8 +226,7 @@ def _progress(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
     """Return a scalar from a csv file of Stable-Baselines3's logger; a row may lack some scalars."""
     found: dict[str, dict[int, float]] = {}
     for path in paths:
-        content = cells_of(path, lines_of(path))
-        _, names = next(content, (0, list[str]()))
+        names, content = table_of(path)
         for line, cells in content:
             row = dict(zip(names, cells))
             if not (step := row.pop(_STEPS, "")):

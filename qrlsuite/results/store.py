@@ -213,17 +213,12 @@ def shortest(values: NDArray[Any]) -> list[float]:
 
 
 def learning_curve(scores: NDArray[np.float32 | np.float64]) -> NDArray[np.float64]:
-    """Return the mean of every epoch's validation scores (..., episodes), rounded by `round_means`."""
+    """Return the mean of every epoch's validation scores (..., episodes), rounded by `settled`."""
     values = np.asarray(scores, np.float64)
     means = values.mean(axis=-1)
     # a mean that is as small as the noise of what it is made of is that noise
     noise = np.abs(means) <= np.finfo(np.float32).eps * np.abs(values).max(axis=-1)
-    return np.where(noise, np.round(means, 7), round_means(means))
-
-
-def round_means(means: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round means of float32 scores, see `qrlsuite.statistics.grid.settled`."""
-    return settled(means)
+    return np.where(noise, np.round(means, 7), settled(means))
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint, provenance, store
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
+from qrlsuite.statistics.grid import settled
 from tests.commands import answer
 from tests.conftest import Train, results
 
@@ -268,7 +269,7 @@ def test_means_are_rounded_to_what_float32_scores_hold() -> None:
     """Seven decimals; small scores keep seven digits, but for the noise of larger ones that cancel."""
     scores = np.array([[0.95] * 100, [1e-9, 3e-9] * 50, [0.1, 0.2, -0.3, 0.0] * 25], np.float32)
     assert store.learning_curve(scores).tolist() == [0.95, 2e-9, 0.0]
-    assert store.round_means(np.array([6 / 11, 0.0, -2 / 3e9, 1e-310])).tolist() == [
+    assert settled(np.array([6 / 11, 0.0, -2 / 3e9, 1e-310])).tolist() == [
         0.5454545,
         0.0,
         -6.666667e-10,

@@ -100,10 +100,10 @@ def test_scripts_run_as_they_are(
         "--task",
         "cartpole",
     ]
-    done = commands.qrlsuite(*typed, "--seeds", "2", "--epochs", "3", "--runs", "results", "--json")
+    done = commands.qrlsuite(*typed, "--seeds", "1", "--epochs", "3", "--runs", "results", "--json")
     assert done.returncode == 0, done.stderr
     found = api.load(f"{name}-mine", runs="results")
-    assert (found.task, found.label, found.curves.shape) == (task, f"script {name}-mine steps=3000", (2, 3))
+    assert (found.task, found.label, found.curves.shape) == (task, f"script {name}-mine steps=3000", (1, 3))
     assert ((found.curves > 0) & (found.curves < 1)).all()
     assert found.hours > 0
     assert found.record.code is not None
@@ -291,7 +291,9 @@ def test_scores_of_another_kind_are_another_task() -> None:
 
 def test_what_a_command_names_and_imports_is_its_code(tmp_path: Path) -> None:
     for name, text in {
-        "lab/train.py": "import net, numpy\nfrom parts.layers import Layer\n",
+        "lab/train.py": "import net, numpy, random\nfrom parts.layers import Layer\nfrom src.deep import buffers\n",
+        "lab/random.py": "",
+        "lab/src/deep/buffers.py": "",
         "lab/net.py": "",
         "lab/parts/__init__.py": "",
         "lab/parts/layers.py": "from . import sizes\n",
@@ -301,7 +303,8 @@ def test_what_a_command_names_and_imports_is_its_code(tmp_path: Path) -> None:
     }.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    own = ["config.yaml", "lab/net.py", "lab/parts/__init__.py", "lab/parts/layers.py", "lab/parts/sizes.py"]
+    parts = ["lab/parts/__init__.py", "lab/parts/layers.py", "lab/parts/sizes.py"]
+    own = ["config.yaml", "lab/net.py", *parts, "lab/random.py", "lab/src/deep/buffers.py"]
     for command in (
         "python lab/train.py --seed {seed} --config=config.yaml",
         "python lab/train.py {seed} config.yaml",
