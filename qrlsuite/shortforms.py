@@ -184,9 +184,7 @@ def notes(module: ModuleType) -> list[str]:
         codes = (getattr(each, "__code__", None) for each in vars(cls).values()) if kind_of(cls) else ()
         names = {name for code in codes if code is not None for name in code.co_names}
         qnodes = sorted(name for name in names if is_qnode(getattr(module, name, None)))
-        if (
-            qnodes and not {"layer", "TorchLayer"} & names
-        ):  # who builds a TorchLayer is refused, in the same words
+        if qnodes and not {"layer", "TorchLayer"} & names:  # `run` refuses a TorchLayer, in the same words
             found.append(
                 f"note: {cls.__name__} calls the QNode {qnodes[0]}, one sample or agent after the other: "
                 f"self.circuit = qrlsuite.layer({qnodes[0]}) is the same circuit for all agents at once"

@@ -64,15 +64,13 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
         _require_all_seeds(folder, entry)
     runs = [store.seed(seed).read() for seed in entry.seeds]
     unfinished = [run.seed for run in runs if not run.finished]
-    if entry.missing and entry.study is None:
+    lacking = entry.missing_text if entry.study is None else ""
+    if unfinished and not lacking:  # of an older version, which recorded no request
+        lacking = f"{len(unfinished)} of {len(runs)} seeds are still training"
+    if lacking:
         raise QrlSuiteError(
-            f"'{entry.label}' is not complete: {entry.missing_text}; repeat the `qrlsuite run` that made it, or "
-            "withdraw them with `qrlsuite runs rm`"
-        )
-    if unfinished:
-        raise QrlSuiteError(
-            f"'{entry.label}' is not complete: {len(unfinished)} of {len(runs)} seeds are still training; "
-            "repeat the `qrlsuite run` that made it"
+            f"'{entry.label}' is not complete: {lacking}; repeat the `qrlsuite run` that made it, or withdraw them "
+            "with `qrlsuite runs rm`"
         )
     withdrawn = {str(seed): reason for seed, reason in entry.withdrawn.items()}
     records = [run.record for run in runs if run.record is not None]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import circuit, registry, specs
-from qrlsuite.circuit import drawing, export, lightcone
+from qrlsuite.circuit import drawing, export, lightcone, resources
 from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
@@ -138,7 +138,7 @@ def _ansatz(
     if format is not None:
         return {"format": format, "text": export.export(drawn, format)}
     content = catalog.describe(specs.AnsatzSpec, name) | {"resources": {}}
-    for resource, count in dataclasses.asdict(drawing.resources(drawn)).items():
+    for resource, count in dataclasses.asdict(resources.resources(drawn)).items():
         content["resources"][resource] = count
         if resource == "parameters":
             rank = jacobian_rank(drawn)

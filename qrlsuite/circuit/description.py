@@ -102,6 +102,9 @@ class Element:
     parameter: str
     index: int
 
+    def __str__(self) -> str:
+        return f"{self.parameter}[{self.index}]"
+
 
 _NUMBER = int, float, np.integer, np.floating
 
@@ -177,7 +180,7 @@ class Angle:
             if parameter := a._parameter:
                 whole = b if b.is_bare_input else Angle(input=Encoding("sum", (b,)))
                 return replace(whole, scale=parameter, times=a.times * whole.times)
-            if a._is_scaled_input or not a.elements:
+            if a.weight is None and (a.scale is None or (a.input is not None and a.constant == 0.0)):
                 inputs = replace(a, scale=None)
                 if inputs.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
                     return Angle(input=a.input, scale=a.scale, factor=b.input, times=a.times * b.times)
@@ -276,12 +279,6 @@ class Angle:
         return self.input is not None and self.scale is None and self.weight is None and self.constant == 0.0
 
     @property
-    def _is_scaled_input(self) -> bool:
-        return (
-            self.input is not None and self.scale is not None and self.weight is None and self.constant == 0.0
-        )
-
-    @property
     def _parameter(self) -> Element | None:
         """The parameter if this is a multiple of one parameter alone."""
         alone = self.input is None and self.constant == 0.0 and (self.scale is None) != (self.weight is None)
@@ -310,6 +307,18 @@ class Angle:
         return replace(
             self, input=place.get(self.input, self.input), factor=place.get(self.factor, self.factor)
         )
+
+    def texts(
+        self,
+        term: Callable[[int | Encoding], str],
+        element: Callable[[Element], str] = str,
+        number: Callable[[float], str] = repr,
+    ) -> tuple[list[str], list[str]]:
+        """Write the factors of the input term, and the weight if there is one, with functions that write each."""
+        factors = [number(float(self.times))] if self._has_term and self.times != 1.0 else []
+        factors += [element(self.scale)] if self.scale else []
+        factors += [term(each) for each in (self.input, self.factor) if each is not None]
+        return factors, [element(self.weight)] if self.weight else []
 
     @property
     def product(self) -> Product | None:
@@ -583,9 +592,7 @@ class Circuit:
                 raise CircuitError(f"input {feature}: this circuit has inputs 0..{self.inputs - 1}")
         if angle.factor is not None and angle.input is None:
             raise CircuitError("a second input needs a first one to multiply")
-        for element in (angle.scale, angle.weight):
-            if element is None:
-                continue
+        for element in angle.elements:
             parameter = self.parameters.get(element.parameter)
             if parameter is None or not 0 <= element.index < parameter.size:
                 raise CircuitError(f"the angle uses {element}, which this circuit does not declare")
@@ -760,13 +767,7 @@ def canonical(circuit: Circuit) -> str:
 
 def _written(angle: Angle) -> str:
     """Write an angle: its constant, and after a plus sign each, its inputs with their scale, and its weight."""
-    inputs = [
-        each.text(_written) if isinstance(each, Encoding) else f"x{each}"
-        for each in (angle.input, angle.factor)
-        if each is not None
-    ]
-    scale = [f"{angle.scale.parameter}[{angle.scale.index}]"] if angle.scale else []
-    weight = [f"{angle.weight.parameter}[{angle.weight.index}]"] if angle.weight else []
-    times = [] if angle.times == 1.0 or not angle._has_term else [repr(float(angle.times))]
-    term = [*times, *scale, *inputs]
-    return "+".join([repr(float(angle.constant)), *(["*".join(term)] if term else []), *weight])
+    factors, weight = angle.texts(
+        lambda term: term.text(_written) if isinstance(term, Encoding) else f"x{term}"
+    )
+    return "+".join([repr(float(angle.constant)), *(["*".join(factors)] if factors else []), *weight])

@@ -9,12 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite.circuit.description import Angle, Circuit, Encoding, Operation
-from qrlsuite.circuit.resources import Resources, gate_name, resources
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["Resources", "angle_text", "draw_figure", "draw_text", "gate_name", "resources"]
 
 # The drawer writes into the options that it is given, hence a copy for each call.
 INK = {"color": "black"}
@@ -23,21 +20,12 @@ BOX = {"facecolor": "white", "edgecolor": "black"}
 
 def angle_text(angle: Angle) -> str:
     """Write an angle as `constant + scale*input + weight`."""
-    terms = []
-    if angle.input is not None or angle.scale is not None:
-        times = [] if angle.times == 1.0 else [f"{angle.times:.4g}"]
-        scale = [] if angle.scale is None else [f"{angle.scale.parameter}[{angle.scale.index}]"]
-        inputs = [
-            each.text(angle_text) if isinstance(each, Encoding) else f"x{each}"
-            for each in (angle.input, angle.factor)
-            if each is not None
-        ]
-        terms.append("*".join([*times, *scale, *inputs]))
-    if angle.weight is not None:
-        terms.append(f"{angle.weight.parameter}[{angle.weight.index}]")
-    if angle.constant or not terms:
-        terms.append(f"{angle.constant:.4g}")
-    return " + ".join(terms)
+    factors, weight = angle.texts(
+        lambda term: term.text(angle_text) if isinstance(term, Encoding) else f"x{term}",
+        number="{:.4g}".format,
+    )
+    terms = [*(["*".join(factors)] if factors else []), *weight]
+    return " + ".join([*terms, *([f"{angle.constant:.4g}"] if angle.constant or not terms else [])])
 
 
 def draw_text(circuit: Circuit, angles: bool = False) -> str:

@@ -53,17 +53,9 @@ def _formula(
         prefix = functions if term.function in FUNCTIONS else ""
         return prefix + term.text(lambda part: _formula(part, feature, element, functions))
 
-    terms = []
-    if angle.input is not None or angle.scale is not None:
-        factors = [] if angle.times == 1.0 else [repr(angle.times)]
-        factors += [] if angle.scale is None else [element(angle.scale)]
-        factors += [factor(each) for each in (angle.input, angle.factor) if each is not None]
-        terms.append(" * ".join(factors))
-    if angle.weight is not None:
-        terms.append(element(angle.weight))
-    if angle.constant or not terms:
-        terms.append(repr(angle.constant))
-    return " + ".join(terms)
+    factors, weight = angle.texts(factor, element)
+    terms = [*([" * ".join(factors)] if factors else []), *weight]
+    return " + ".join([*terms, *([repr(angle.constant)] if angle.constant or not terms else [])])
 
 
 def _rotations(operation: Operation, angles: list[str]) -> Iterable[tuple[str, str]]:
@@ -86,10 +78,7 @@ def _qiskit(circuit: Circuit) -> str:
         lines.append(f'{name} = ParameterVector("{name}", {parameter.size})  # {_shape(parameter.shape)}')
     lines += ["", f"circuit = QuantumCircuit({circuit.qubits})"]
     for operation in circuit:
-        angles = [
-            _formula(a, lambda i: f"x[{i}]", lambda e: f"{e.parameter}[{e.index}]", "np.")
-            for a in operation.angles
-        ]
+        angles = [_formula(a, lambda i: f"x[{i}]", str, "np.") for a in operation.angles]
         wires = ", ".join(map(str, operation.qubits))
         controlled = "" if operation.control is None else "c"
         if not angles:

@@ -75,9 +75,8 @@ def uses(circuit: Circuit) -> dict[Scalar, list[int]]:
     places: dict[Scalar, list[int]] = {}
     for index, op in enumerate(circuit.operations):
         for angle in op.angles:
-            for element in (angle.scale, angle.weight):
-                if element is not None:
-                    places.setdefault((element.parameter, element.index), []).append(index)
+            for element in angle.elements:
+                places.setdefault((element.parameter, element.index), []).append(index)
     return places
 
 

@@ -1,7 +1,8 @@
 import pytest
 
 from qrlsuite.circuit import Circuit, ansatz
-from qrlsuite.circuit.drawing import draw_figure, draw_text, resources
+from qrlsuite.circuit.drawing import draw_figure, draw_text
+from qrlsuite.circuit.resources import resources
 
 
 def test_resources_of_a_small_circuit_counted_by_hand():
