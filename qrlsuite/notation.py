@@ -89,14 +89,13 @@ def parse_entry(text: str) -> Written:
 
 
 def joined(words: Sequence[str]) -> str:
-    """Return words of a command line as one text; a script's command is one of them, with its white space.
+    """Return words of a command line as one text; a script's command and curve are one of them each, with white space.
 
     >>> joined(["script", "ppo-mine", "command=python ppo.py --seed {seed}"])
     "script ppo-mine command='python ppo.py --seed {seed}'"
     """
-    return " ".join(
-        write_setting(*word.split("=", 1)) if word.startswith("command=") else word for word in words
-    )
+    whole = "command=", "curve="
+    return " ".join(write_setting(*word.split("=", 1)) if word.startswith(whole) else word for word in words)
 
 
 def parse_named(text: str, prefix: str = "") -> tuple[str, dict[str, Any]]:

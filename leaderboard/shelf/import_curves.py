@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import notation, registry, specs
+from qrlsuite import notation
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import FileError, OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import task as tasks
@@ -227,7 +227,7 @@ def _worst(curves: Iterable[NDArray[np.float64]], file: TaskFile) -> float:
 
 def _known_task(name: str, runs: Path) -> tuple[TaskFile, dict[str, Any], str] | None:
     """Return a task's file, its definition and its name: of the suite, or of an entry in the results folder."""
-    if name.endswith(".toml") or name.startswith("gym:") or name in registry.load().of(specs.TaskSpec):
+    if tasks.is_known(name):
         loaded = tasks.load(name)
         return loaded.file, loaded.definition, loaded.name
     if runs.is_dir() and "/" not in name and (held := entries(runs, name)):

@@ -65,9 +65,9 @@ def find(
             )
         done = store.finished(left, last)
         groups = [SeedGroup((seed,), 0) for seed in left if seed not in done]
-        return Missing(runs, entry, store, requested, last, frozenset(busy), groups, code)
-    missing = plan_groups(store, left, last, where.workers)
-    return Missing(runs, entry, store, requested, last, frozenset(busy), missing, code)
+    else:
+        groups = plan_groups(store, left, last, where.workers)
+    return Missing(runs, entry, store, requested, last, frozenset(busy), groups, code)
 
 
 def _require_one_command(runs: Path, entry: Entry) -> None:

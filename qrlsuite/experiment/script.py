@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options, registry, specs
+from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError
 from qrlsuite.experiment import source, task
 from qrlsuite.experiment.task import EXTERNAL, Scale, Task
@@ -125,9 +125,7 @@ def place(name: str | Task, script: Script) -> tuple[Task, Script]:
     given = [option for option in OF_TASKS if getattr(script, option) is not None]
     if isinstance(name, Task):
         found = name
-    elif given and not (
-        name.endswith(".toml") or name in registry.load().of(specs.TaskSpec) or task.is_quick(name)
-    ):
+    elif given and not task.is_known(name):
         if script.steps is None:
             raise OptionError(f"task '{name}' is new: say how long a run is with steps=N")
         every = script.every or max(1, script.steps // POINTS)

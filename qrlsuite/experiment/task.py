@@ -678,6 +678,11 @@ def is_quick(name: str) -> bool:
     return name.startswith("gym:") or (without_lanes and name not in registered.of(specs.TaskSpec))
 
 
+def is_known(name: str) -> bool:
+    """Whether `load` finds a task by a name."""
+    return name.endswith(".toml") or is_quick(name) or name in registry.load().of(specs.TaskSpec)
+
+
 def load(name: str) -> Task:
     """Load a registered task by name, a task file by path (anything that ends in `.toml`), or `gym:ID`.
 

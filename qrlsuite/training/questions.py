@@ -27,10 +27,9 @@ SECONDS = 10.0
 STEPS = 300
 """In which lanes with equal streams are compared, and rare draws are waited for."""
 SEEDS, CHANGES = 8, 20
-"""Seeds with equal weights, and equal changes from an episode to the next, that are no chance any more.
+"""Seeds that begin with equal weights, and changes between episodes that two lanes share, until chance is ruled out.
 
-Lanes that draw independently, whatever the number of different episodes, show so many equal ones with a probability
-below 1e-7.
+Lanes that draw independently share so many with a probability below 1e-7, however few different episodes there are.
 """
 
 STREAMS = (

@@ -203,6 +203,9 @@ def test_failures_say_what_to_do(walk: Path) -> None:
 
 def test_a_long_word_is_no_file_and_a_link_is_not_written_through(walk: Path) -> None:
     typed = [f"{word} {'x' * 300}" if "command=" in word else word for word in words(0, 1)]
+    typed[typed.index("curve=curve-{seed}.csv")] = "curve=my curves/{seed}.csv"
+    (walk / "my curves").mkdir()
+    (walk / "my curves" / "0.csv").symlink_to("../curve-0.csv")
     assert commands.qrlsuite(*typed).returncode == 0
     store, secret = the_entry(walk / "runs"), walk / "secret"
     secret.write_text("mine")
