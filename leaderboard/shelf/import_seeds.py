@@ -11,7 +11,7 @@ import functools
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,11 @@ from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.records import MEASURED, Provenance, RunRecord
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
-    ASIDE,
     Arrays,
     EntryStore,
     SeedRun,
     SeedStore,
+    Writer,
     entries,
     json_line,
     table_bytes,
@@ -172,10 +172,6 @@ def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
         )
 
 
-Writer = Callable[[SeedStore], None]
-"""Writes a seed into an empty folder."""
-
-
 def unite(
     store: EntryStore, source: Path | str, offered: Mapping[int, tuple[NDArray[np.float64], Writer | None]]
 ) -> tuple[list[int], list[int], list[int], list[str]]:
@@ -202,7 +198,7 @@ def unite(
         if not np.array_equal(own[:shared], curve[:shared]):
             differing.append(seed)
         elif write is not None and (seed not in present or len(own) < len(curve)):
-            if _place(store, seed, write):
+            if store.put(seed, write):
                 new.append(seed)
                 continue
             bare.append(seed)
@@ -223,33 +219,6 @@ def unite(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
         )
     return new, known, differing, notes
-
-
-def _place(store: EntryStore, seed: int, write: Writer) -> bool:
-    """Put a seed into its place, whole or not at all; an existing seed stays until the new one is whole.
-
-    A seed without an agent does not replace one that has an agent: False.
-    """
-    place = store.seed(seed).path
-    made, aside = (place.with_name(f".{place.name}{end}") for end in (".import", ASIDE))
-    try:
-        shutil.rmtree(made, ignore_errors=True)
-        write(SeedStore(made, seed))
-        if store.seed(seed).agent.exists() and not SeedStore(made, seed).agent.exists():
-            shutil.rmtree(made, ignore_errors=True)
-            return False
-        if place.exists():
-            shutil.rmtree(aside, ignore_errors=True)
-            place.rename(aside)
-        made.rename(place)
-        if aside.exists():
-            aside.rename(made)  # so that a half-removed folder is never put back
-        shutil.rmtree(made, ignore_errors=True)
-    except OSError as error:
-        store.seeds()  # puts the old seed back
-        shutil.rmtree(made, ignore_errors=True)
-        raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
-    return True
 
 
 def _of_runs(

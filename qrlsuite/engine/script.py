@@ -12,7 +12,6 @@ import datetime
 import json
 import os
 import shlex
-import shutil
 import signal
 import socket
 import subprocess
@@ -231,22 +230,19 @@ class _Run:
         return scores, {**origin, "command": shlex.join(self.words)}
 
     def save(self, store: EntryStore, code: CodeIdentity, cpu: float) -> None:
-        """Put the seed into its place, whole or not at all."""
+        """Store the seed."""
         scores, origin = self._curve()
-        place = store.seed(self.seed).path
-        made = SeedStore(place.with_name(f".{place.name}.made"), self.seed)
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         made_with = [provenance.collect([]).content]
         facts = {"code": code.record(), "imported": origin, "agent": False, "provenance": made_with}
         planned = {} if self.entry.study is None else {"plan": self.entry.study}
-        try:
-            shutil.rmtree(made.path, ignore_errors=True)
+        times = {"epoch": len(scores), "cpu": cpu, "host": socket.gethostname(), "time": now}
+
+        def write(made: SeedStore) -> None:
             made.write_curve(store.record(), scores, **planned, **facts)
-            times = {"epoch": len(scores), "cpu": cpu, "host": socket.gethostname(), "time": now}
             write_atomically(made.timings, json_line(times))
-            made.path.rename(place)
-        except OSError as error:
-            raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
+
+        store.put(self.seed, write)
 
 
 def _start(command: list[str], folder: Path, output: IO[bytes]) -> subprocess.Popen[bytes]:

@@ -25,8 +25,9 @@ import itertools
 import json
 import os
 import re
+import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -634,6 +635,10 @@ def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     return row
 
 
+Writer = Callable[[SeedStore], None]
+"""Writes a seed into an empty folder."""
+
+
 class EntryStore:
     """The folder of one entry."""
 
@@ -754,6 +759,32 @@ class EntryStore:
                     aside.rename(place)
         matches = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
         return sorted(int(match.group(1)) for match in matches if match)
+
+    def put(self, seed: int, write: Writer) -> bool:
+        """Put a seed into its place, whole or not at all; an existing seed stays until the new one is whole.
+
+        A seed without an agent does not replace one that has an agent: False.
+        """
+        place = self.seed(seed).path
+        made, aside = (place.with_name(f".{place.name}{end}") for end in (".import", ASIDE))
+        try:
+            shutil.rmtree(made, ignore_errors=True)
+            write(SeedStore(made, seed))
+            if self.seed(seed).agent.exists() and not SeedStore(made, seed).agent.exists():
+                shutil.rmtree(made, ignore_errors=True)
+                return False
+            if place.exists():
+                shutil.rmtree(aside, ignore_errors=True)
+                place.rename(aside)
+            made.rename(place)
+            if aside.exists():
+                aside.rename(made)  # so that a half-removed folder is never put back
+            shutil.rmtree(made, ignore_errors=True)
+        except OSError as error:
+            self.seeds()  # puts the old seed back
+            shutil.rmtree(made, ignore_errors=True)
+            raise StoreError(f"cannot write {place}: {error.strerror or error}") from None
+        return True
 
     def start_of(self, seed: int) -> Path:
         """Return the file of the agent with which a seed's training begins, where its entry begins with agents."""
