@@ -349,7 +349,7 @@ def _require_no_copies(entry: str, curves: Mapping[int, NDArray[np.float64]], st
     Curves of one or two values are allowed: runs that learn nothing share them.
     """
     first: dict[bytes, int] = {}
-    for seed in store.seeds() if store.path.is_dir() else []:
+    for seed in store.seeds():
         with contextlib.suppress(StoreError):  # a damaged seed is said where it is read
             run = store.seed(seed).read()
             if seed not in curves and len(run.scores):

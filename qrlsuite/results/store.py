@@ -664,7 +664,7 @@ class EntryStore:
     def trained(self) -> str:
         """When the newest epoch of its seeds ended, in UTC; empty if not recorded."""
         times = [""]
-        for seed in self.seeds() if self.path.is_dir() else ():
+        for seed in self.seeds():
             with contextlib.suppress(StoreError):  # is said where the seed is read
                 times += [line.time for line in self.seed(seed).times()[-1:]]
         return max(times)
@@ -757,7 +757,8 @@ class EntryStore:
             if _SEED_FOLDER.fullmatch(place.name) and not place.exists():
                 with contextlib.suppress(OSError):  # the import is alive, or the folder cannot be written
                     aside.rename(place)
-        matches = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
+        children = self.path.iterdir() if self.path.is_dir() else ()
+        matches = [_SEED_FOLDER.fullmatch(child.name) for child in children if child.is_dir()]
         return sorted(int(match.group(1)) for match in matches if match)
 
     def put(self, seed: int, write: Writer) -> bool:

@@ -188,8 +188,7 @@ class Study:
         for folder in (self.runs, self.runs / TUNING, *(path for path in studies if path != self.folder)):
             for name, entry in self.entries.items():
                 path = folder / entry.task.name / entry.name
-                trained = EntryStore(path).seeds() if path.is_dir() else []
-                if seeds := [seed for seed in trained if seed in own]:
+                if seeds := [seed for seed in EntryStore(path).seeds() if seed in own]:
                     yield f"seeds {format_seeds(seeds)} of '{name}' were trained already ({path})"
         for log in (path / LOG for path in studies if (path / LOG).is_file()):
             file, lines = log.with_name(FILE), read_records(log, LookLine)
@@ -200,7 +199,8 @@ class Study:
             shared = {table.hash for table in self.file.entries} & {table.hash for table in kept.entries}
             for plan in dict.fromkeys(line.plan for line in lines if line.plan not in (None, self.hash)):
                 block = blocks.get(plan, own)
-                if (shared or log.parent == self.folder) and max(block[0], own[0]) <= min(block[-1], own[-1]):
+                common = range(max(block.start, own.start), min(block.stop, own.stop))
+                if common and (shared or log.parent == self.folder):
                     yield f"study {plan} has seen these seeds ({log}), and what they showed may have chosen this one"
 
     def _next_block(self) -> int:
@@ -226,8 +226,7 @@ class Study:
         """Refuse an entry without seeds if its code is not the code in the study's hash."""
         for table, (name, entry) in zip(self.file.entries, self.entries.items()):
             store = EntryStore.find(self.folder, entry)
-            begun = store.path.is_dir() and bool(store.seeds())
-            if not begun and _has_other_code(table, entry):
+            if not store.seeds() and _has_other_code(table, entry):
                 raise OptionError(f"{self.source}: {self._other_code(name)}")
 
     @staticmethod
@@ -254,7 +253,7 @@ class Study:
         for name, entry in self.entries.items():
             store, curves = EntryStore.find(self.folder, entry), dict[int, NDArray[np.float64]]()
             trained[name], hours[name] = curves, 0.0
-            for seed in store.seeds() if store.path.is_dir() else []:
+            for seed in store.seeds():
                 folder, record = store.seed(seed), store.seed(seed).record()
                 if record is not None:
                     self.require_own(name, seed, record.plan)

@@ -34,7 +34,9 @@ from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
+from qrlsuite.studies.looks import Study
 from qrlsuite.studies.state import needs_text
+from qrlsuite.studies.study import load
 from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, cases, results
 
@@ -445,6 +447,8 @@ def test_a_study_that_begins_again_needs_other_seeds(refused: Refused) -> None:
     log = folder / "looks.jsonl"
     log.write_text(re.sub(r',"seeds":\[\d+,\d+\]', "", log.read_text()))
     assert seen in refused("study", "run", "widths.toml", "--engine", "scripted"), "logs of earlier versions"
+    log.write_text(re.sub(r'("begun":[^}]*)\}', r'\1,"seeds":[5,5]}', log.read_text()))
+    assert not list(Study(load("widths.toml"), Path("runs")).seen_before()), "a block of no seeds"
 
 
 def test_seeds_that_a_study_lost_are_named() -> None:
