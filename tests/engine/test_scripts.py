@@ -138,6 +138,7 @@ def test_a_killed_seed_begins_again_and_none_is_lost_or_doubled(moment: str, lin
     run = commands.start(*typed, cwd=walk)
     curve = walk / "curve-0.csv"
     while not (curve.exists() and curve.read_text().count("\n") > lines):
+        assert run.poll() is None, "it has ended before"
         time.sleep(0.02)
     kill(moment, run, walk, runs)
     code = run.wait()
