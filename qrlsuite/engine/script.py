@@ -124,7 +124,7 @@ class _Run:
         self.entry, self.script, self.folder = entry, entry.script, entry.folder
         self.seed, self.output, self.file = seed, output, entry.task.file
         self.words = self.script.words(seed)
-        self.told = f"seed {seed}: {shlex.join(self.words)}"
+        self.name = f"seed {seed}: {shlex.join(self.words)}"
         self._before = self._files()
 
     def _files(self) -> dict[Path, tuple[int, int]]:
@@ -157,16 +157,16 @@ class _Run:
                 with guard.deferred():
                     _end(process)
         if process.returncode < 0:
-            raise KilledError(f"{self.told} was ended by {signal.Signals(-process.returncode).name}")
+            raise KilledError(f"{self.name} was ended by {signal.Signals(-process.returncode).name}")
         if process.returncode:
             lines = self.output.read_text(errors="replace").strip().splitlines() or ["it printed nothing"]
             raise QrlSuiteError(
-                f"{self.told} ended with exit code {process.returncode}: {printable(lines[-1])[:300]} (all that it "
+                f"{self.name} ended with exit code {process.returncode}: {printable(lines[-1])[:300]} (all that it "
                 f"printed: {self.output})"
             )
 
     def _look(self, progress: Progress, seconds: float) -> None:
-        """Take in how far the curve is; a file that is just being written may not be read."""
+        """Take in how far the curve is; a file that is just being written may end in the middle of a number."""
         try:
             found = self._points()
         except FileError:
@@ -174,20 +174,21 @@ class _Run:
         every = self.file.protocol.interactions
         self._require_begun(found)
         epoch = min(int(found.steps[-1]) // every, self.entry.epochs)
-        if epoch > progress.epoch:
+        scores = self._scores(found.scores[:-1])
+        if epoch > progress.epoch and len(scores):
             progress.epoch_seconds = seconds / epoch
-            progress.finished_epoch(epoch, [float(self._scores(found.scores[-1:])[0])], [False])
+            progress.finished_epoch(epoch, [float(scores[-1])], [False])
 
     def _points(self) -> Points:
         files = [path for path, status in self._files().items() if status != self._before.get(path)]
         if not files:
             raise FileError(
-                f"{self.told} wrote no file that '{self.script.curve}' names in {self.folder}: say where its curve is, "
+                f"{self.name} wrote no file that '{self.script.curve}' names in {self.folder}: say where its curve is, "
                 "as in curve=logs/{seed}.csv"
             )
         if len({path.parent for path in files}) > 1:
             raise FileError(
-                f"{self.told} wrote curves of several runs: {listed([str(path) for path in files])}"
+                f"{self.name} wrote curves of several runs: {listed([str(path) for path in files])}"
             )
         return points.read_run(files, self.script.metric)
 
@@ -195,7 +196,7 @@ class _Run:
         every = self.file.protocol.interactions
         if found.steps[0] > every:
             raise QrlSuiteError(
-                f"{self.told}: its first score is at step {found.steps[0]}, after the first epoch of {every} steps: "
+                f"{self.name}: its first score is at step {found.steps[0]}, after the first epoch of {every} steps: "
                 "scores are not carried backward; give a task with longer epochs"
             )
 
@@ -205,7 +206,7 @@ class _Run:
         scores = settled(values / best)
         if self.file.ranking.thresholds is None and not ((scores > -1e-6) & (scores < 1 + 1e-6)).all():
             raise QrlSuiteError(
-                f"{self.told}: its scores go from {values.min():g} to {values.max():g}, and those of the task from 0 "
+                f"{self.name}: its scores go from {values.min():g} to {values.max():g}, and those of the task from 0 "
                 f"to {best:g}"
             )
         return scores
@@ -217,12 +218,12 @@ class _Run:
         last, steps = int(found.steps[-1]), every * self.entry.epochs
         if last < (1 - REST) * steps:
             raise QrlSuiteError(
-                f"{self.told}: its curve ends at step {last} of {steps}: nobody knows the scores after it. If a run is "
+                f"{self.name}: its curve ends at step {last} of {steps}: nobody knows the scores after it. If a run is "
                 f"shorter, say steps={last // every * every}"
             )
         if self.script.kind is None and scripts.kind_of(found.metric) != self.script.scores:
             raise QrlSuiteError(
-                f"{self.told}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME"
+                f"{self.name}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME"
             )
         grid = every * np.arange(1, self.entry.epochs + 1)
         scores = self._scores(found.scores[np.searchsorted(found.steps, grid, side="right") - 1])

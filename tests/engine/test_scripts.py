@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from qrlsuite.experiment import script as scripts
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.results import points
 from qrlsuite.results.claims import claims
+from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import EntryStore
 from tests import commands
 from tests.engine.stress import children
@@ -276,6 +278,18 @@ reason = "a test"
     published = commands.qrlsuite("verify", "out", "--rerun", "1")
     assert "not repeatable here: a script trained it" in published.stdout + published.stderr
     assert api.load("walk", runs="copy").seeds == (1, 2)
+
+
+def test_a_number_that_is_half_written_ends_no_run(tmp_path: Path) -> None:
+    options = "curve={seed}.csv steps=100 every=10 maximum=1"
+    entry = replace(resolve("walks", f"script x command='a {{seed}}' {options}"), folder=tmp_path)
+    run, progress = engine_script._Run(entry, 0, tmp_path / "output"), Progress(size=1)
+    (tmp_path / "0.csv").write_text("step,score\n10,0.5\n20,9.5")  # of 9.5e-05
+    run._look(progress, 1.0)
+    assert (progress.epoch, progress.seed_scores) == (2, [0.5])
+    (tmp_path / "0.csv").write_text("step,score\n10,0.5\n20,9.5\n30,1")
+    with pytest.raises(QrlSuiteError, match="those of the task from 0 to 1"):
+        run._look(progress, 1.0)
 
 
 def test_scores_of_another_kind_are_another_task() -> None:
