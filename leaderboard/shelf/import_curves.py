@@ -96,7 +96,7 @@ def import_points(
     curves = {run: _on_grid(own, step, lengths[run[0]], run, instead) for run, own in points.items()}
     if known is None:
         _require_reachable(curves, options.thresholds or [], options.goal == "below")
-        file = _new_task(name, step, curves, options)
+        file = tasks.external(name, options, step, max(lengths.values()), min(lengths.values()))
         definition = Task(file, name).definition
     else:
         file, definition, name = known
@@ -282,16 +282,6 @@ def _require_reachable(
             f"{'below' if below else 'above'} them from its first point on. Write scores as the files have them, which "
             f"lie between {low:g} and {high:g}"
         )
-
-
-def _new_task(name: str, every: int, curves: Mapping[Run, NDArray[np.float64]], scale: Scale) -> TaskFile:
-    """Return the file of a task that these curves are the first of."""
-    lengths: dict[str, list[int]] = defaultdict(list)
-    for (entry, _), curve in curves.items():
-        lengths[entry].append(len(curve))
-    common = min(sorted(own, reverse=True)[(len(own) - 1) // 2] for own in lengths.values())
-    epochs = max(map(len, curves.values()))
-    return tasks.external(name, scale, every, epochs, common)
 
 
 def _require_same_options(file: TaskFile, scale: Scale) -> None:
