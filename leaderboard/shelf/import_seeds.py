@@ -107,9 +107,7 @@ def import_seeds(source: EntryStore, runs: Path, study: str | None = None) -> Im
         Hash of the study with looks that the results folder belongs to, if it does.
     """
     exported = published.read(source.path) if published.is_published(source.path) else None
-    record = (
-        source.record()
-    )  # what another program made is imported from its files; a script's seeds can go on here
+    record = source.record()  # a script's seeds can go on here; other programs' curves come from their files
     entry = record.entry(str(source.path)) if record.identity.algorithm == SCRIPT else source.entry()
     if entry.study != study:
         raise StoreError(

@@ -130,8 +130,7 @@ def _ansatz(
     picture_format = pictures.format_of(out, "--out")
     if "name" in settings:
         raise OptionError(f"ansatz '{name}': name: no option of that name")
-    size = registry.get(specs.AnsatzSpec, name).size
-    sizes = {"qubits": 4, "layers": 2, **size, **settings}
+    sizes = {"qubits": 4, "layers": 2, **registry.get(specs.AnsatzSpec, name).size, **settings}
     drawn = circuit.ansatz(name, **sizes)
     if code:
         return {"circuit text": canonical(drawn), **identity.of_registered(specs.AnsatzSpec, name, drawn)}
@@ -144,9 +143,8 @@ def _ansatz(
             rank = jacobian_rank(drawn)
             text = f"not computed where gates connect more than {LARGEST_RANK} qubits"
             content["resources"]["jacobian_rank"] = text if rank is None else rank
-    numbers = (1,) if size else range(1, drawn.qubits + 3)
     content["light_cone"] = lightcone.described(
-        drawn, lambda layers: circuit.ansatz(name, **{**sizes, "layers": layers}), numbers
+        drawn, lambda layers: circuit.ansatz(name, **{**sizes, "layers": layers})
     )
     if out is not None:
         write_atomically(out, pictures.encode(drawing.draw_figure(drawn), picture_format))

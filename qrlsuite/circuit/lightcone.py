@@ -65,20 +65,19 @@ def _seen(circuit: Circuit) -> list[set[int]]:
     return found
 
 
-def described(circuit: Circuit, build: Callable[[int], Circuit], numbers: Sequence[int]) -> dict[str, str]:
+def described(circuit: Circuit, build: Callable[[int], Circuit]) -> dict[str, str]:
     """Describe what reaches the outputs of a circuit, in words.
 
     Parameters
     ----------
     build:
-        Returns the same ansatz with a number of layers, or refuses it with `OptionError`.
-    numbers:
-        The numbers of layers to look for the first with which every output sees every input.
+        Returns the same ansatz with a number of layers, or refuses it with `OptionError`. Up to two layers more than
+        there are qubits are tried, until every output sees every input.
     """
-    least = f"more than {numbers[-1]}"
-    for layers in numbers:
+    least = f"more than {circuit.qubits + 2}"
+    for layers in range(1, circuit.qubits + 3):
         with contextlib.suppress(OptionError):
-            each = build(layers)
+            each, least = build(layers), f"more than {layers}"
             if all(len(inputs) == each.inputs for inputs in _seen(each)):
                 least = str(layers)
                 break

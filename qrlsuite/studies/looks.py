@@ -157,9 +157,7 @@ class Study:
     def check(self) -> bool:
         """Refuse a study that changed after it began, or whose seeds were trained before; return whether it began."""
         if not self.begun:
-            for table, (name, entry) in zip(self.file.entries, self.entries.items()):
-                if _has_other_code(table, entry):
-                    raise OptionError(f"{self.source}: {self._other_code(name)}")
+            self._require_code_of_new_entries()
             for line in self.seen_before():
                 raise OptionError(
                     f"{self.source}: {line}: a study with looks needs seeds that nobody has seen; with first_seed = "
@@ -227,14 +225,10 @@ class Study:
         for table, (name, entry) in zip(self.file.entries, self.entries.items()):
             store = EntryStore.find(self.folder, entry)
             if not store.seeds() and _has_other_code(table, entry):
-                raise OptionError(f"{self.source}: {self._other_code(name)}")
-
-    @staticmethod
-    def _other_code(name: str) -> str:
-        return (
-            f"the code of '{name}' is not what it was when the study was written, and its hash covers it: restore "
-            "that code, or write another study with `qrlsuite study new`"
-        )
+                raise OptionError(
+                    f"{self.source}: the code of '{name}' is not what it was when the study was written, and its hash "
+                    "covers it: restore that code, or write another study with `qrlsuite study new`"
+                )
 
     def end(self) -> None:
         """Close the study for good, with its open pairs open."""

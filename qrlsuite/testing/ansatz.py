@@ -152,10 +152,7 @@ def _effects(circuits: Circuits, grows: bool) -> None:
 def _light_cone(build: Any, options: Any, circuits: Circuits) -> str:
     """Say what the structure of the largest circuit of up to three layers leaves without effect."""
     largest = max(size for size in circuits if size[1] in LAYERS)
-    numbers = range(1, largest[0] + 3) if len(circuits) > 1 else (1,)
-    cone = lightcone.described(
-        circuits[largest], lambda k: cast(Circuit, build(largest[0], k, options)), numbers
-    )
+    cone = lightcone.described(circuits[largest], lambda k: cast(Circuit, build(largest[0], k, options)))
     sees = "layers_until_every_output_sees_every_input"
     return (
         f"dead parameters ({effects.size(*largest)}): {cone['dead_parameters']}; "
