@@ -310,13 +310,11 @@ class State(Shown):
         """Describe the seeds and hours used and saved, and the next look."""
         if not self.begun:
             most = facts["core_hours_at_most"]
-            cost = (
-                f": {hours_range(*most)} core-hours"
-                if most
-                else ", of unknown cost. To measure it, on seeds that no board counts:"
-            )
+            cost = f": {hours_range(*most)} core-hours" if most else ", of unknown cost"
+            measuring = list(self._measuring())
+            cost += ". To measure it, on seeds that no board counts:" if measuring else ""
             yield f"at most {len(self.study.entries) * self.study.design.looks[-1]} seeds{cost}"
-            yield from self._measuring()
+            yield from measuring
             return
         if self.ended:
             yield f"ended {self.ended}: open pairs stay open"

@@ -226,6 +226,8 @@ class Search(Shown):
         self.runs = results / FOLDER
         self.notation = notation.parse_entry(request.entry).given(settings=request.settings)
         self.base = self._entry()
+        if self.base.script is not None:
+            raise OptionError(f"'{self.base.label}' is not tuned here: its settings are in its command")
         self.epochs = request.epochs or self.base.epochs
         self.trials: list[Trial] = []
         self.pending: list[Entry] = []

@@ -204,6 +204,14 @@ def test_failures_say_what_to_do(walk: Path) -> None:
     assert not (walk / "pwned").exists()
 
 
+def test_a_script_is_planned_without_a_measurement_and_not_tuned(walk: Path) -> None:
+    entries = [f"script {name} command='walk.py {{seed}}' steps=100 thresholds=20" for name in ("walk", "b")]
+    planned = commands.qrlsuite("study", "new", "walks.toml", *entries, "--task", "walks", "--looks", "20")
+    assert "at most 40 seeds, of unknown cost\n" in planned.stdout + planned.stderr
+    tuned = commands.qrlsuite("tune", entries[0], "--task", "walks", "--vary", "steps=100,200")
+    assert "'script walk' is not tuned here: its settings are in its command" in tuned.stderr
+
+
 def test_a_long_word_is_no_file_and_a_link_is_not_written_through(walk: Path) -> None:
     typed = [f"{word} {'x' * 300}" if "command=" in word else word for word in words(0, 1)]
     typed[typed.index("curve=curve-{seed}.csv")] = "curve=my curves/{seed}.csv"
