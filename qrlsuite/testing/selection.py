@@ -48,7 +48,8 @@ def select(word: str) -> list[CheckTarget]:
     if distribution is not None:
         return of_distribution(distribution)
     names = {each.spec.name for each in registered} | _distributions()
-    raise UnknownNameError(f"nothing called '{word}' is registered{nearest(word, names)}")
+    hint = f": --plugin {word} loads it" if word.endswith(".py") else nearest(word, names)
+    raise UnknownNameError(f"nothing called '{word}' is registered{hint}")
 
 
 def of_distribution(distribution: str) -> list[CheckTarget]:

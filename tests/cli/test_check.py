@@ -183,6 +183,7 @@ def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check
 
 WRONG = """
 tidi => nothing called 'tidi' is registered; did you mean 'tidy'?
+mine.py => nothing called 'mine.py' is registered: --plugin mine.py loads it
 engine:tidi => unknown engine 'tidi'; did you mean 'tidy'?
 engin:tidy => unknown kind 'engin'; did you mean 'engine'?
 distribution:tidi => no plugin is of a distribution 'tidi'; did you mean 'tidy'?
