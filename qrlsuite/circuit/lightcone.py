@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
-from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
+from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z, rotation
 from qrlsuite.errors import OptionError
 
 PAULIS: dict[str, Matrix] = {"I": np.eye(2, dtype=np.complex128), "X": X, "Y": Y, "Z": Z}
-ROTATIONS = {"RX": "X", "RY": "Y", "RZ": "Z"}
 ANY = 0.7345
 """An angle that stands for any: no rotation by it maps a Pauli to another one."""
 
@@ -113,7 +112,7 @@ def _steps(circuit: Circuit) -> Iterator[Step]:
 
 def _rotations(operation: Operation) -> Iterator[tuple[str, Angle, tuple[int, ...]]]:
     gate, qubits, angles = operation.gate, operation.qubits, operation.angles
-    if gate in ROTATIONS:
+    if gate in ("RX", "RY", "RZ"):
         yield gate, angles[0], qubits
     elif angles:
         order = (0, 1, 2) if gate == "Rot" else (2, 0, 1)  # U3 is a phase times Rot(delta, theta, phi)
@@ -144,7 +143,7 @@ def _image(
     """
     gate: Any = FIXED.get(name)
     if gate is None:
-        gate = np.cos(angle / 2) * PAULIS["I"] - 1j * np.sin(angle / 2) * PAULIS[ROTATIONS[name]]
+        gate = rotation(PAULIS[name[1]], angle)
     if controlled:
         gate = np.kron(np.diag([1, 0]), PAULIS["I"]) + np.kron(np.diag([0, 1]), gate)
     after: list[set[str]] = [set() for _ in letters]

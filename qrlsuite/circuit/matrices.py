@@ -21,3 +21,9 @@ FIXED: dict[str, Matrix] = {
     "CZ": np.diag([1, 1, 1, -1]).astype(np.complex128),
     "SWAP": np.eye(4, dtype=np.complex128)[[0, 2, 1, 3]],
 }
+
+
+def rotation(pauli: Matrix, angle: float) -> Matrix:
+    """Return exp(-i angle pauli / 2)."""
+    rotated: Matrix = np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
+    return rotated

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.circuit import Angle, Circuit, Operation
 from qrlsuite.circuit.description import FUNCTIONS, Encoding
-from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
-
-_PAULIS = {"X": X, "Y": Y, "Z": Z}
+from qrlsuite.circuit.matrices import FIXED, Matrix, Y, Z, rotation
 
 
 def expectation_values(
@@ -34,7 +32,7 @@ def expectation_values(
     for qubits, axes in zip(circuit.measured, circuit.axes):
         turned = state
         for q, axis in zip(qubits, axes):
-            turned = np.moveaxis(np.tensordot(_PAULIS[axis], turned, axes=(1, q)), 0, q)
+            turned = np.moveaxis(np.tensordot(FIXED[axis], turned, axes=(1, q)), 0, q)
         values.append(float(np.vdot(state, turned).real))
     return np.array(values)
 
@@ -55,7 +53,7 @@ def _mean_field_values(
         together /= np.einsum("ijij", together)  # else the rounding of the trace grows with every gate
         states[a], states[b] = np.einsum("ikjk->ij", together), np.einsum("kikj->ij", together)
     single = zip(circuit.measured, circuit.axes)
-    return np.array([float(np.trace(_PAULIS[axis] @ states[q]).real) for (q,), axis in single])
+    return np.array([float(np.trace(FIXED[axis] @ states[q]).real) for (q,), axis in single])
 
 
 def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]) -> float:
@@ -79,18 +77,13 @@ def _feature(term: int | Encoding | None, inputs: NDArray[np.float64]) -> float:
     return sum(values) if term.function == "sum" else math.prod(values)
 
 
-def _rotation(pauli: Matrix, angle: float) -> Matrix:
-    rotated: Matrix = np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
-    return rotated
-
-
 def _matrix(operation: Operation, angles: list[float]) -> Matrix:
     """Return the matrix of an operation on (control, wires): 2 x 2 or 4 x 4."""
     gate = operation.gate
     if gate in ("RX", "RY", "RZ"):
-        matrix = _rotation({"RX": X, "RY": Y, "RZ": Z}[gate], angles[0])
+        matrix = rotation(FIXED[gate[1]], angles[0])
     elif gate == "Rot":
-        matrix = _rotation(Z, angles[2]) @ _rotation(Y, angles[1]) @ _rotation(Z, angles[0])
+        matrix = rotation(Z, angles[2]) @ rotation(Y, angles[1]) @ rotation(Z, angles[0])
     elif gate == "U3":
         t, p, d = angles
         matrix = np.array(
