@@ -42,7 +42,16 @@ NAMES: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "step": (
         ("step",),
-        ("steps", "timestep", "timesteps", "total_timesteps", "env_step", "env_steps", "global_step"),
+        (
+            "steps",
+            "timestep",
+            "timesteps",
+            "total_timesteps",
+            "time/total_timesteps",
+            "env_step",
+            "env_steps",
+            "global_step",
+        ),
         EPISODES,
     ),
     "score": (("score",), *((name,) for name in run_files.METRICS)),

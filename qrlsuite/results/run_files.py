@@ -43,9 +43,6 @@ WINDOW = 100
 
 _LONGEST_LINE = 1_000_000
 
-_STEPS = "time/total_timesteps"
-"""The column of steps in the `progress.csv` of Stable-Baselines3's logger."""
-
 _CURVES = "evaluations.npz", "*monitor.csv", "*.tfevents.*", "*.csv"
 _MOST_PATHS = 100_000
 
@@ -102,8 +99,8 @@ def words(path: Path) -> tuple[str, ...]:
     a name of its own, or a csv file whose columns no program fixes.
     """
     place = path.absolute()
-    kind = _kind(path)
-    named_by_itself = kind is None or (kind is _evaluations and path.name != "evaluations.npz")
+    fixed = path.name in ("evaluations.npz", "progress.csv")
+    named_by_itself = not fixed and _kind(path) in (None, _evaluations)
     run = place.with_suffix("") if named_by_itself else place.parent
     return (*run.parent.parts[1:], run.name)
 
@@ -114,7 +111,7 @@ def read(paths: Sequence[Path], metric: str | None = None) -> tuple[str, Curve]:
     Parameters
     ----------
     metric:
-        The scalar of TensorBoard or progress.csv that is the score.
+        The scalar of TensorBoard that is the score.
     """
     kinds = {_kind(path) for path in paths}
     reader = _kind(paths[0])
@@ -134,8 +131,6 @@ def _kind(path: Path) -> Callable[[Sequence[Path], str | None], tuple[str, Curve
         return _tensorboard
     if name.endswith(".npz"):
         return _evaluations
-    if name == "progress.csv" and _STEPS in next(lines_of(path), ""):
-        return _progress
     return _monitor if name == "monitor.csv" or name.endswith(".monitor.csv") else None
 
 
@@ -220,25 +215,6 @@ def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
         if episode[1] < 1:
             raise FileError(f"{path}, line {line + 1}: an episode of {episode[1]} steps")
         yield episode
-
-
-def _progress(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
-    """Return a scalar from a csv file of Stable-Baselines3's logger; a row may lack some scalars."""
-    found: dict[str, dict[int, float]] = {}
-    for path in paths:
-        names, content = table_of(path)
-        for line, cells in content:
-            row = dict(zip(names, cells))
-            if not (step := row.pop(_STEPS, "")):
-                continue  # of a callback that does not say its steps
-            for name in (name for name, cell in row.items() if cell):
-                try:
-                    score = float(row[name]) if name in (METRICS if metric is None else (metric,)) else 0.0
-                    _collect(found, name, whole(step), score, metric, path)
-                except (ValueError, OverflowError):
-                    where = f"{path}, line {line}"
-                    raise FileError(f"{where}: {name} {row[name][:40]!a} at step {step[:40]!a}") from None
-    return _chosen(found, metric, paths[0])
 
 
 def _evaluations(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:

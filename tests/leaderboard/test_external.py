@@ -448,9 +448,7 @@ def test_scalars_that_stable_baselines3_logs(sb3: Path, name: str) -> None:
     assert found["small", 1].steps.tolist() == [100, 200]
     np.testing.assert_allclose(found["small", 1].scores, evaluated["results"].mean(axis=1), rtol=1e-6)
     assert points.read_files(files, "rollout/ep_rew_mean")["small", 1].steps.tolist() == [64, 128, 192, 256]
-    with pytest.raises(
-        QrlSuiteError, match=r"name the scalar that is the score with metric=NAME; found .*eval/mean_reward"
-    ):
+    with pytest.raises(QrlSuiteError, match=r"metric=NAME.*eval/mean_reward"):
         points.read_files(files, "reward")
 
 
@@ -467,7 +465,7 @@ def test_progress_files_are_told_by_their_columns(tmp_path: Path) -> None:
     path = tmp_path / "seed-1" / "progress.csv"
     path.parent.mkdir()
     path.write_text("time/total_timesteps,note,rollout/ep_rew_mean\n,a callback,\n32,,5\n64,,high\n")
-    with pytest.raises(QrlSuiteError, match=r"line 4: rollout/ep_rew_mean 'high' at step '64'"):
+    with pytest.raises(QrlSuiteError, match=r"line 4: no step and score: '64,,high'"):
         points.read_files([path])
     path.write_text("entry,seed,step,score\nmine,1,10,0.5\n")
     assert list(points.read_files([path])) == [("mine", 1)], "a name alone says nothing"
