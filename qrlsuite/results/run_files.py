@@ -15,7 +15,7 @@ import shlex
 import stat
 import zipfile
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -267,18 +267,27 @@ def _tensorboard(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]
     """Return a scalar of event files; the last written value of a step counts."""
     if importlib.util.find_spec("tensorboard") is None:
         raise FileError(f"{paths[0]}: to read it, pip install 'qrlsuite[tensorboard]'")
+    wanted = METRICS if metric is None else (metric,)
     found: dict[str, dict[int, float]] = {}
     for path in sorted(paths, key=lambda path: path.name):
         try:
             for tag, step, value in _scalars(path):
-                _collect(found, tag, step, value, metric, path)
+                values = found.setdefault(tag, {})
+                if tag in wanted:
+                    values[step] = value
+                if len(values) > MOST_POINTS or len(found) > 10_000:
+                    raise FileError(f"{path}: more than {MOST_POINTS:,} points or 10,000 scalars")
         except FileError:
             raise
         except Exception as error:  # whatever the library says of a damaged file
             raise FileError(
                 f"{path} is not a readable event file: {' '.join(str(error).split())[:200]}"
             ) from None
-    return _chosen(found, metric, paths[0])
+    name = next((name for name in wanted if found.get(name)), None)
+    if name is None:
+        here = listed([ascii(each)[1:-1][:60] for each in sorted(found)]) or "none"
+        raise FileError(f"{paths[0]}: name the scalar that is the score with metric=NAME; found {here}")
+    return name, sorted(found[name].items())
 
 
 def _scalars(path: Path) -> Iterator[tuple[str, int, float]]:
@@ -290,23 +299,3 @@ def _scalars(path: Path) -> Iterator[tuple[str, int, float]]:
         for value in event.summary.value:
             if value.metadata.plugin_data.plugin_name == "scalars" and value.HasField("tensor"):
                 yield value.tag, int(event.step), float(make_ndarray(value.tensor).item())
-
-
-def _collect(
-    found: dict[str, dict[int, float]], name: str, step: int, value: float, metric: str | None, path: Path
-) -> None:
-    """Keep a scalar's value if it may be the score; of others, the name."""
-    values = found.setdefault(name, {})
-    if name == metric or (metric is None and name in METRICS):
-        values[step] = value
-    if len(values) > MOST_POINTS or len(found) > 10_000:
-        raise FileError(f"{path}: more than {MOST_POINTS:,} points or 10,000 scalars")
-
-
-def _chosen(found: Mapping[str, Mapping[int, float]], metric: str | None, path: Path) -> tuple[str, Curve]:
-    """Return the score's name, and its values by step."""
-    name = metric or next((name for name in METRICS if found.get(name)), "")
-    if not found.get(name):
-        here = listed([ascii(each)[1:-1][:60] for each in sorted(found)]) or "none"
-        raise FileError(f"{path}: name the scalar that is the score with metric=NAME; found {here}")
-    return name, sorted(found[name].items())
