@@ -141,7 +141,7 @@ def select(
 
 
 def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
-    """Count the pairs of entries that rule `times` decides, and all pairs that it tests: both of 20 seeds or more.
+    """Count the pairs of entries that rule `steps` decides, and all pairs that it tests: both of 20 seeds or more.
 
     Entries are compared within a task, at its shortest horizon; Holm's procedure goes over the task's pairs. Entries
     of a study with looks are left out: their number of seeds depends on results.

@@ -92,7 +92,7 @@ def power(
 ) -> SeedsNeeded:
     """Simulate how many seeds find that another entry is 10, 25 or 50 percent slower than this one.
 
-    Of two entries, also how many find the difference between them. Pairs are judged by rule `times` at alpha = .05:
+    Of two entries, also how many find the difference between them. Pairs are judged by rule `steps` at alpha = .05:
     all seeds at once, and with looks.
 
     Parameters

@@ -139,9 +139,8 @@ def _different(first: Arrays, second: Arrays) -> str:
 def difference(together: Side, alone: Side) -> str:
     """Name the first difference; empty if there is none."""
     for number, lines in enumerate(zip(together.lines, alone.lines), start=1):
-        line, other = map(
-            flatten, lines
-        )  # rows of a table nest values, and have None where an epoch has none
+        # rows of a table nest values, and have None where an epoch has none
+        line, other = map(flatten, lines)
         for name in {**line, **other}:
             if line.get(name) != other.get(name):
                 return f"'{name}' of epoch {number}"

@@ -1,4 +1,4 @@
-"""How many runs it takes to tell two entries apart: by rule `times`, all at once or with looks.
+"""How many runs it takes to tell two entries apart: by rule `steps`, all at once or with looks.
 
 Entries are drawn from smoothed models of pilot runs, or of a similar published entry (`SmoothedRuns`), and judged like
 real ones. The result holds for entries like the pilot, within the simulation's error.

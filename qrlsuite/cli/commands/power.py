@@ -45,7 +45,7 @@ def power(
     """Say how many seeds it takes to find that another entry is 10, 25 or 50 percent slower than this one.
 
     For two entries, also say how many it takes to find the difference between them. Pairs are simulated from the
-    curves and judged by rule `times` at alpha = .05: all seeds at once, and with looks, as
+    curves and judged by rule `steps` at alpha = .05: all seeds at once, and with looks, as
     `qrlsuite study new` writes them.
 
     Examples: qrlsuite power "mlp width=64" --task beam6g --published; qrlsuite power --like results.csv maximum=500
