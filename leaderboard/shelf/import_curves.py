@@ -437,23 +437,16 @@ def _notation_of(entry: str) -> tuple[str, dict[str, Any]]:
     """Return the model and the options that an entry's name states, as `mlp width=64` does."""
     try:
         words = [word for word in notation.split(entry) if "=" not in word]
-        found = {
-            setting.name: setting.value
-            for word in notation.split(entry)
-            if "=" in word
-            for setting in [parse_setting(word)]
-        }
+        settings = map(parse_setting, (word for word in notation.split(entry) if "=" in word))
+        found = {setting.name: setting.value for setting in settings}
     except QrlSuiteError:
         words, found = [entry], {}
     plain = re.sub(r"[^a-z0-9]+", "-", " ".join(words).lower()).strip("-")[:40].rstrip("-")
-    kept = {
-        name: value for name, value in found.items() if isinstance(value, bool | int | str) or _finite(value)
+    finite = {
+        name: value for name, value in found.items() if not isinstance(value, float) or math.isfinite(value)
     }
-    return plain or "curves", kept
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, float) and math.isfinite(value)
+    options = {name: value for name, value in finite.items() if isinstance(value, bool | int | float | str)}
+    return plain or "curves", options
 
 
 def _notes(
