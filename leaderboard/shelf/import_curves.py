@@ -286,27 +286,24 @@ def _require_reachable(
 
 def _require_same_options(file: TaskFile, scale: Scale) -> None:
     """Refuse options that contradict a task."""
-    maximum, thresholds, every = scale.maximum, scale.thresholds, scale.every
-    step, ranking = file.protocol.interactions, file.ranking
-    if scale.goal not in (None, file.score.goal):
-        raise OptionError(f"goal={scale.goal}: task '{file.name}' has {file.score.goal}; leave it out")
-    if every not in (None, step):
-        raise OptionError(f"every={every}: task '{file.name}' has a grid of {step} steps; leave it out")
-    best = file.score.max_return if file.environment.name == EXTERNAL else None
-    if best is not None and maximum not in (None, best):
-        raise OptionError(
-            f"maximum={maximum:g}: task '{file.name}' has {best:g}; give this one another --task NAME"
-        )
-    if maximum is not None and ranking.thresholds is not None:
-        raise OptionError(
-            f"maximum={maximum:g}: task '{file.name}' has thresholds on the score itself; leave it out"
-        )
-    unit = 1.0 if ranking.epsilons is None else file.score.max_return or maximum or 1.0
-    own = sorted(unit * level for level in ranking.grid.thresholds)
-    if thresholds and not (len(own) == len(thresholds) and np.allclose(own, thresholds)):
-        raise OptionError(
-            f"thresholds: task '{file.name}' has {', '.join(f'{level:g}' for level in own)}; leave them out"
-        )
+    ranking, best = file.ranking, file.score.max_return
+    unit = 1.0 if ranking.epsilons is None else best or scale.maximum or 1.0
+    levels = sorted(unit * level for level in ranking.grid.thresholds)
+    given = scale.thresholds or levels
+    alike = len(given) == len(levels) and np.allclose(given, levels)
+    pairs: dict[str, tuple[object, object]] = {
+        "goal": (scale.goal, file.score.goal),
+        "every": (scale.every, file.protocol.interactions),
+        "thresholds": (None if alike else given, ", ".join(f"{level:g}" for level in levels)),
+    }
+    if file.environment.name == EXTERNAL or ranking.thresholds is not None:
+        pairs["maximum"] = scale.maximum, "none" if best is None else best
+    for name, (asked, stands) in pairs.items():
+        if asked not in (None, stands):
+            value = f"{stands:g}" if isinstance(stands, float) else stands
+            raise OptionError(
+                f"{name}: task '{file.name}' has {value}; leave it out, or give another --task NAME"
+            )
 
 
 def _scores(

@@ -179,7 +179,7 @@ def test_scores_and_grid_of_a_task_of_the_suite(tmp_path: Path) -> None:
     file = entry.task_file
     assert entry.steps_per_epoch == file.protocol.interactions
     assert entry.curves[0, -1] == 250 / (file.score.max_return or 1)
-    with pytest.raises(OptionError, match="every=7: task 'cartpole' has a grid of"):
+    with pytest.raises(OptionError, match="every: task 'cartpole' has 1000; leave it out"):
         api.import_curves(runs, steps=[900, 2000], task="cartpole", every=7, runs=tmp_path)
     with pytest.raises(QrlSuiteError, match="are not between 0 and 1"):
         api.import_curves({"a": ([0], [[5.0]])}, steps=[2000], task="beam6g", runs=tmp_path)
@@ -198,9 +198,9 @@ def test_more_seeds_are_added_and_those_here_stay(tmp_path: Path) -> None:
     [after] = api.import_curves(longer, steps=[10, 20, 30, 40], runs=tmp_path)
     assert (after.new, api.load("a", runs=tmp_path).records[0].epochs) == ((0, 1), 4), "the longer curve wins"
     for options, message in (
-        ({"maximum": 20}, "task 'external' has 10; give this one another --task NAME"),
-        ({"thresholds": [5]}, "task 'external' has 6, 7, 8, 9; leave them out"),
-        ({"every": 20}, "task 'external' has a grid of 10 steps"),
+        ({"maximum": 20}, "maximum: task 'external' has 10; leave it out, or give another --task NAME"),
+        ({"thresholds": [5]}, "task 'external' has 6, 7, 8, 9; leave it out"),
+        ({"every": 20}, "every: task 'external' has 10; leave it out"),
     ):
         with pytest.raises(OptionError, match=message):
             take({"b": ([0], [[1, 2, 3]])}, **options)
