@@ -138,10 +138,10 @@ def sweep(population: nn.Module, parameters: Sequence[Tensor], activation: str) 
         return kept
     if activation == "tanh" or not compilable(*parameters):
         return None
-    from qrlsuite.compiled.perceptron import Sweep, in_one_block
+    from qrlsuite.compiled.perceptron import LayersSweep, in_one_block
 
     in_one_block(parameters)
-    kept = population.__dict__["_sweep"] = Sweep(parameters[::2], parameters[1::2], activation)
+    kept = population.__dict__["_sweep"] = LayersSweep(parameters[::2], parameters[1::2], activation)
     return kept
 
 

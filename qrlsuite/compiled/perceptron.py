@@ -1,9 +1,10 @@
-"""Layers of networks as one compiled sweep, by itself and behind a `torch.autograd.Function`."""
+"""Networks as one compiled sweep, by itself and behind a `torch.autograd.Function`; first of all their layers."""
 
 from __future__ import annotations
 
 import functools
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,48 +43,51 @@ def perceptron(
     Tensor
         (S, B, out), differentiable once. A seed's numbers have the same bits in any population.
     """
-    return Sweep(weights, biases, activation)(x)
+    return LayersSweep(weights, biases, activation)(x)
 
 
-class Sweep:
-    """The layers of S networks, ready for compiled passes.
+class Sweep(ABC):
+    """A population of S networks whose passes are compiled: (S, B, in) to (S, B, out).
 
     Parameters
     ----------
-    weights, biases:
-        Of every layer (S, out, in) and (S, out), float32 on the CPU. They are read where they lie if weights and biases
-        of the layers lie one behind the other (`in_one_block`), else copied.
-    activation:
-        "none", "relu" or "sin", after every layer but the last.
+    tensors:
+        All parameters (S, ...), float32 on the CPU. They are read where they lie if they lie one behind the other
+        (`in_one_block`), else copied.
+    inputs:
+        Numbers of a sample.
+
+    Attributes
+    ----------
+    parameters:
+        All numbers of `tensors`, one behind the other. Gradients of a pass are laid out as they are.
+    places:
+        Where the tensors lie: a sweep serves as long as they stay there.
     """
 
-    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: str) -> None:
-        self.tensors = [each for pair in zip(weights, biases) for each in pair]
-        self.shapes = [each.shape for each in self.tensors]
-        self.sizes = _sizes(weights, biases)
-        self.seeds, self.activation = self.shapes[0][0], activation
-        self.code, self.rows, self.shapes_of_work = _plan(tuple(self.sizes.tolist()), activation)
-        self.parameters = joined(self.tensors)
-        self.places = [each.data_ptr() for each in self.tensors]
+    def __init__(self, tensors: Sequence[Tensor], inputs: int) -> None:
+        self.tensors, self.inputs = list(tensors), inputs
+        self.shapes = [each.shape for each in tensors]
+        self.seeds = self.shapes[0][0]
+        self.parameters = joined(tensors)
+        self.places = [each.data_ptr() for each in tensors]
         self.kept_gradients: Array | None = None
         self._kept_parts: list[Tensor] = []
+
+    @abstractmethod
+    def values(self, x: Array, keep: bool) -> tuple[Array, Any]:
+        """Return outputs (S, B, out) of x (S, B, in), and the records of the pass, all of them if `keep`."""
+
+    @abstractmethod
+    def pull(self, records: Any, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
+        """Write the gradients of the parameters (in their layout) and of x, given cotangents (S, B, out)."""
 
     def __call__(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
         if torch.is_grad_enabled() and (x.requires_grad or any(each.requires_grad for each in self.tensors)):
-            result: Tensor = _Perceptron.apply(x, self, *self.tensors)  # type: ignore[no-untyped-call]
+            result: Tensor = _Swept.apply(x, self, *self.tensors)  # type: ignore[no-untyped-call]
             return result
         return torch.from_numpy(self.values(array(x), False)[0])
-
-    def values(self, x: Array, keep: bool) -> tuple[Array, _Records]:
-        """Return outputs (S, B, out) of x (S, B, in), and the records of the pass, all of them if `keep`."""
-        if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.sizes[0]:
-            raise _misfit(x.shape, self.shapes)
-        chunks = self.seeds * -(-x.shape[1] // WIDE) if keep else 1
-        records = _Records("records", chunks, self.rows, WIDE)
-        out = np.empty((*x.shape[:2], self.shapes[-1][1]), np.float32)
-        networks.forward(x, self.parameters, self.sizes, self.code, records.array, keep, out)
-        return out, records
 
     def best(self, x: Array) -> NDArray[np.int64]:
         """Return which output is the largest (S, B), the first of equal ones."""
@@ -111,14 +115,14 @@ class Sweep:
         self.set_gradients(records, cotangents)
         return errors
 
-    def set_gradients(self, records: _Records, cotangents: Array) -> None:
-        """Write the gradients of cotangents (S, B, out) to `grad` of the parameters, in memory that is used again."""
+    def set_gradients(self, records: Any, cotangents: Array) -> None:
+        """Write the gradients of cotangents (S, B, out) to `grad` of trained parameters, in memory used again."""
         if self.kept_gradients is None:
             self.kept_gradients = np.empty_like(self.parameters)
             self._kept_parts = self.parts(self.kept_gradients)
         self.pull(records, cotangents, self.kept_gradients, None)
         for tensor, part in zip(self.tensors, self._kept_parts):
-            tensor.grad = part
+            tensor.grad = part if tensor.requires_grad else None
 
     def gradients_of(self, parameters: Sequence[Tensor]) -> Array | None:
         """Return all parameters' gradients, if the arguments are these parameters with gradients of `set_gradients`."""
@@ -127,9 +131,42 @@ class Sweep:
         same = zip(parameters, self.tensors, self._kept_parts)
         return self.kept_gradients if all(p is own and p.grad is part for p, own, part in same) else None
 
-    def pull(self, records: _Records, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
-        """Write the gradients of the parameters (in their layout) and of x, given cotangents (S, B, out)."""
-        pair, turned, sums = (_Records(*shape) for shape in self.shapes_of_work)
+    def parts(self, gradients: Array) -> list[Tensor]:
+        """Return the gradients of each parameter, in their order."""
+        parts = torch.from_numpy(gradients).split([shape.numel() for shape in self.shapes])
+        return [part.view(shape) for part, shape in zip(parts, self.shapes)]
+
+
+class LayersSweep(Sweep):
+    """The layers of S networks.
+
+    Parameters
+    ----------
+    weights, biases:
+        Of every layer (S, out, in) and (S, out), float32 on the CPU; one block has a layer's bias behind its weights.
+    activation:
+        "none", "relu" or "sin", after every layer but the last.
+    """
+
+    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: str) -> None:
+        self.sizes = _sizes(weights, biases)
+        super().__init__([each for pair in zip(weights, biases) for each in pair], int(self.sizes[0]))
+        self.activation = activation
+        self.code, self.rows, self.shapes_of_work = _plan(tuple(self.sizes.tolist()), activation)
+
+    def values(self, x: Array, keep: bool) -> tuple[Array, Records]:
+        """Return outputs and records, see `Sweep`."""
+        if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.inputs:
+            raise _misfit(x.shape, self.shapes)
+        chunks = self.seeds * -(-x.shape[1] // WIDE) if keep else 1
+        records = Records("records", chunks, self.rows, WIDE)
+        out = np.empty((*x.shape[:2], self.shapes[-1][1]), np.float32)
+        networks.forward(x, self.parameters, self.sizes, self.code, records.array, keep, out)
+        return out, records
+
+    def pull(self, records: Records, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
+        """Write gradients, see `Sweep`."""
+        pair, turned, sums = (Records(*shape) for shape in self.shapes_of_work)
         networks.backward(
             cotangents,
             self.parameters,
@@ -143,11 +180,6 @@ class Sweep:
             np.empty((1, 1, 1), np.float32) if x_gradient is None else x_gradient,
             x_gradient is not None,
         )
-
-    def parts(self, gradients: Array) -> list[Tensor]:
-        """Return the gradients of each weight and bias, in the order of the layers."""
-        parts = torch.from_numpy(gradients).split([shape.numel() for shape in self.shapes])
-        return [part.view(shape) for part, shape in zip(parts, self.shapes)]
 
 
 def array(tensor: Tensor) -> Array:
@@ -225,7 +257,7 @@ def _unchosen(places: NDArray[np.int64], values: Array) -> ValueError:
     )
 
 
-class _Records:
+class Records:
     """Memory (n, rows, wide) of a pass, such as a chunk's values in every layer; it then serves another pass."""
 
     def __init__(self, purpose: str, number: int, rows: int, wide: int) -> None:
@@ -240,8 +272,8 @@ class _Records:
             spare[self.key] = self.array
 
 
-class _Perceptron(torch.autograd.Function):
-    """Outputs of layers, with the gradients of inputs, weights and biases."""
+class _Swept(torch.autograd.Function):
+    """Outputs of a sweep, with the gradients of inputs and parameters."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, sweep: Sweep, *parameters: Tensor) -> Tensor:
@@ -254,14 +286,14 @@ class _Perceptron(torch.autograd.Function):
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError(
-                "compiled layers of a network are differentiated once: leave out create_graph=True, or compute in "
+                "compiled passes of a network are differentiated once: leave out create_graph=True, or compute in "
                 "float64, which torch differentiates any number of times"
             )
         _ = ctx.saved_tensors  # refuses those that changed since
         sweep, cotangent = ctx.sweep, array(cotangents[0])
         x_gradient = None
         if ctx.needs_input_grad[0]:
-            x_gradient = np.empty((*cotangent.shape[:2], sweep.sizes[0]), np.float32)
+            x_gradient = np.empty((*cotangent.shape[:2], sweep.inputs), np.float32)
         gradients = np.empty_like(sweep.parameters)
         sweep.pull(ctx.records, cotangent, gradients, x_gradient)
         return None if x_gradient is None else torch.from_numpy(x_gradient), None, *sweep.parts(gradients)
