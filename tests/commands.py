@@ -77,6 +77,8 @@ class Fork:
         self.returncode: int | None = None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Python 3.12 warns of threads, of which there are none
+            # a signal that comes before the child has handlers of its own would be handled by its parent's, and lost
+            held = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
             self.pid = os.fork()
         if self.pid == 0:
             code = 1
@@ -86,6 +88,7 @@ class Fork:
                     (signal.SIGTERM, signal.SIG_DFL),
                 ):
                     signal.signal(number, handler)
+                signal.pthread_sigmask(signal.SIG_SETMASK, held)
                 code = int(program() or 0)  # type: ignore[call-overload]
             except SystemExit as end:
                 if isinstance(end.code, str):
@@ -98,6 +101,7 @@ class Fork:
                     sys.stdout.flush()
                     sys.stderr.flush()
                 os._exit(code)
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
 
     def poll(self) -> int | None:
         """Return the exit code of a process that has ended."""

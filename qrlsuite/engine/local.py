@@ -5,7 +5,6 @@ A killed worker loses at most the work since its last checkpoint, and disturbs n
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import signal
@@ -202,18 +201,19 @@ class LocalEngine:
         to_come = sum(largest - taken[job.name] for job in self._running)
         return 0 < largest <= free - to_come
 
-    def stop(self, patience: float = 60.0, again: float = 10.0) -> None:
-        """Ask every worker to save and end; after `patience` seconds, end them.
-
-        Asked again every `again` seconds: a worker that is starting may lose a signal, in an import or a fork.
-        """
+    def stop(self, patience: float = 60.0) -> None:
+        """Ask every worker to save and end; after `patience` seconds, end them."""
         processes = [job.process for job in self._running if job.process is not None]
+        for process in processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
         deadline = time.monotonic() + patience
-        while going_on := [process for process in processes if process.poll() is None]:
-            for process in going_on:
-                process.send_signal(signal.SIGTERM if time.monotonic() < deadline else signal.SIGKILL)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                going_on[0].wait(again)
+        for process in processes:
+            try:
+                process.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
         for job in self._running:
             job.take_output()
         self._running.clear()

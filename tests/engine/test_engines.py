@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -360,22 +359,3 @@ def test_a_killed_run_goes_on_where_the_system_lacks_what_linux_has(
     second = qrlsuite(*command, env=hold.environment)
     assert second.returncode == 0, second.stderr
     assert results(entry, 0) == results(train("alone", [0]), 0)
-
-
-def test_a_worker_that_loses_a_signal_is_asked_again() -> None:
-    """As one that is starting may, in an import or a fork: it is not waited for until patience ends."""
-    code = (
-        "import signal, sys, time\n"
-        "asked = []\n"
-        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7) if asked else asked.append(1))\n"
-        "print('ready', flush=True)\n"
-        "time.sleep(3600)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    with process.stdout:
-        assert process.stdout.readline() == b"ready\n"
-    engine = LocalEngine()
-    engine._running = [SimpleNamespace(process=process, take_output=lambda: None)]  # type: ignore[list-item]
-    engine.stop(patience=3600.0, again=0.1)
-    assert process.returncode == 7
