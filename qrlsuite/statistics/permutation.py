@@ -37,7 +37,7 @@ from qrlsuite.statistics.times import check_probability, times_below
 CHUNK = 10_000
 """Relabelings that are made at a time, and the least that decide."""
 _EXACT = 2**24  # float32 counts so far without error
-_ROWS = 16  # of runs that are multiplied at the same time, where there are no more pairs
+_ROWS, _COLUMNS = 64, 1000  # of runs and labelings that are multiplied at the same time: what a cache holds
 _TOGETHER = 64  # pairs whose relabelings are in memory at the same time
 
 Blocks = tuple[tuple[int, int], ...]
@@ -267,10 +267,8 @@ def welch_t(first: IntArray, second: IntArray) -> FloatArray:
 
 def ratio_t(first: IntArray, second: IntArray) -> FloatArray:
     """Return the log ratio of two means over its standard error (delta method), shape (E,), see `welch_t`."""
-    sides = [
-        (len(each), each.sum(axis=0), (each.astype(np.float64) ** 2).sum(axis=0)) for each in (first, second)
-    ]
-    ratio, variance = log_ratio(*sides)
+    sides = (each.astype(np.float64) for each in (first, second))  # squares of whole sums may overflow
+    ratio, variance = log_ratio(*((len(each), each.sum(axis=0), (each**2).sum(axis=0)) for each in sides))
     return studentized(ratio, variance)
 
 
@@ -282,11 +280,15 @@ def log_ratio(first: Sums, second: Sums) -> tuple[FloatArray, FloatArray]:
     """Return the log of the second's mean over the first's, and its variance by the delta method, elementwise."""
     variance: FloatArray | float = 0.0
     for count, total, square in (first, second):
-        relative = square * (count / total**2) - 1
-        relative[relative < 1e-12] = 0  # what rounding leaves of zero
-        variance = variance + relative / (count - 1)
-    ratio = np.log(second[1] / second[0]) - np.log(first[1] / first[0])
-    ratio[np.abs(ratio) < 1e-12] = 0
+        relative = square * (count / total**2)
+        relative -= 1
+        relative *= relative >= 1e-12  # what rounding leaves of zero
+        relative /= count - 1
+        variance = variance + relative
+    ratio = np.log(second[1] / second[0]) - np.log(
+        first[1] / first[0]
+    )  # swapped, the negative to the last bit
+    ratio *= np.abs(ratio) >= 1e-12
     return ratio, np.asarray(variance)
 
 
@@ -435,14 +437,16 @@ class _RatioStatistics(_Statistics):
 
     def counted(self, labels: Sequence[NDArray[Any]]) -> IntArray:
         """Return, shape (P, E), how many of these labelings, by block, have a maximum of at least the observed."""
-        largest = self.largest(labels)
-        return np.stack(
-            [
-                np.count_nonzero(largest >= each[:, None] * (1 - 1e-9), axis=1)
-                for each in self.observed.astype(np.float64)
-            ],
-            axis=1,
+        reached, least = (
+            np.zeros((self.n_pairs, self.n_comparisons), dtype=np.int64),
+            self.observed * (1 - 1e-9),
         )
+        for begin in range(0, labels[0].shape[1], _COLUMNS):
+            largest = self.largest([each[:, begin : begin + _COLUMNS] for each in labels])
+            reached += np.stack(
+                [np.count_nonzero(largest >= each[:, None], axis=1) for each in least], axis=1
+            )
+        return reached
 
     def largest(self, labels: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Return, shape (P, labelings), the largest statistic of each labeling; both powers are summed at once."""

@@ -211,6 +211,9 @@ def test_the_log_ratio_over_its_error_by_hand() -> None:
     expected = np.log(2) / np.sqrt(1 / 4 + 1 / 16)
     assert ratio_t(first, second) == pytest.approx([expected])
     assert ratio_t(second, first) == pytest.approx([-expected])
+    assert ratio_t(10**9 * first, 10**9 * second) == pytest.approx([expected]), (
+        "squares of sums exceed whole numbers"
+    )
     assert ratio_t(column(5, 5), column(5, 5)).tolist() == [0]
     assert ratio_t(column(5, 5), column(9, 9)).tolist() == [np.inf]
 
