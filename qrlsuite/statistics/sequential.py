@@ -31,7 +31,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
-from qrlsuite.statistics.permutation import CHUNK, MOST, Blocks, MaxT, relabelings_for, with_half_epoch
+from qrlsuite.statistics.permutation import Blocks, MaxT, relabelings_for, with_half_epoch
+from qrlsuite.statistics.steps import RISK, relabel
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
 from qrlsuite.statistics.times_board import log_ratios
 
@@ -39,8 +40,6 @@ RULES = ("times", "steps")
 """Rules that may judge the pairs of a design."""
 MOST_RELABELINGS = 200_000
 """At levels below 1e-4 a difference needs p = 1 / 200,001 or so; at levels below that there is none."""
-SETTLED_RISK = 1e-3
-"""Probability that more relabelings would turn a decision of a look by rule `steps`."""
 _POINTS = 1001  # of the numerical integration
 _TAIL = 9.0  # standard deviations beyond which a density is nothing
 
@@ -473,7 +472,11 @@ def next_look(
         data.append((times[study][pair.first][:n_runs], times[study][pair.second][:n_runs]))
     test = MaxT(data, design.blocks[: look + 1], design.seed, ratio=design.rule == "steps")
     if test.ratio and settled:
-        _settle(test, [design.level(look, 1 + others) for others in range(len(design.family))])
+        levels = {design.level(look, 1 + others) for others in range(len(design.family))}
+        count = len(test.t)
+        relabel(
+            test, lambda: np.any([test.turns(np.full(count, each), RISK / count) for each in levels], axis=0)
+        )
     else:
         test.extend(min(relabelings_for(design.level(look, len(design.family))), MOST_RELABELINGS))
     p, p_each = test.p, test.p_each
@@ -491,16 +494,6 @@ def next_look(
                 result[study][index] = _relabeled(result[study][index], data[row], test, row)
         _close(design, look, result[study])
     return result
-
-
-def _settle(test: MaxT, levels: Sequence[float]) -> None:
-    """Relabel until no p can cross any of the levels, or 10 million times."""
-    count, which = CHUNK, np.arange(len(test.t))
-    while len(which):
-        test.extend(count, which)
-        turns = [test.turns(np.full(len(test.t), level), SETTLED_RISK / len(test.t)) for level in levels]
-        which = np.flatnonzero(np.any(turns, axis=0) & (test.n_relabelings < MOST))
-        count = min(2 * count, MOST)
 
 
 def _looked(

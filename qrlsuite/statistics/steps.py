@@ -6,8 +6,10 @@ ratio exists where a mean is 0. docs/error-rates.md has how this test was chosen
 
 from __future__ import annotations
 
+import functools
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -26,13 +28,11 @@ from qrlsuite.statistics.permutation import (
 
 LEAST_RUNS = 4
 """Below this number of runs of either entry there is no verdict."""
-_RISK = 1e-3  # that more relabelings would turn any decision
+RISK = 1e-3
+"""Probability that more relabelings would turn any decision."""
 _CHUNKS, _IN_TAIL = 10, 5  # of relabelings, for an interval: at most; and relabelings beyond its end
-_STEPS, _CLOSE, _ENDLESS = (
-    100,
-    1e-4,
-    20.0,
-)  # until an end is found, so closely; and beyond which there is none
+# until an end is found, so closely; and beyond which there is none
+_STEPS, _CLOSE, _ENDLESS = 100, 1e-4, 20.0
 
 
 def settle(test: MaxT, alpha: float, seconds: float = math.inf) -> BoolArray:
@@ -47,22 +47,34 @@ def settle(test: MaxT, alpha: float, seconds: float = math.inf) -> BoolArray:
     seconds:
         After which it stops; at the latest it stops at 10 million relabelings.
     """
-    begun, n_pairs = time.monotonic(), len(test.t)
-    count, which = CHUNK, np.arange(n_pairs)
-    while len(which):
-        test.extend(count, which)
+    n_pairs = len(test.t)
+
+    def turning() -> BoolArray:
         order = np.argsort(test.p, kind="stable")
         levels = np.empty(n_pairs)
         levels[order] = alpha / np.arange(n_pairs, 0, -1)
-        turns = test.turns(levels, _RISK / n_pairs)
-        kept = ~turns & (test.p > levels)  # Holm's procedure rejects nothing beyond the first of them
-        first = int(np.argmax(kept[order])) if kept.any() else n_pairs
-        turns[order[first:]] = False
-        which = np.flatnonzero(turns & (test.n_relabelings < MOST))
+        turns = test.turns(levels, RISK / n_pairs)
+        kept = ~turns & (test.p > levels)
+        if kept.any():  # Holm's procedure ends at the first of them: the others can turn at its level alone
+            first = int(np.argmax(kept[order]))
+            at_end = test.turns(np.full(n_pairs, levels[order[first]]), RISK / n_pairs)
+            turns[order[first:]] = at_end[order[first:]]
+        return turns
+
+    return relabel(test, turning, seconds)
+
+
+def relabel(test: MaxT, turning: Callable[[], BoolArray], seconds: float = math.inf) -> BoolArray:
+    """Relabel the pairs that still may turn, shape (P,), until none may, the time is over or it is 10 million times."""
+    begun, count = time.monotonic(), CHUNK
+    turns = np.ones(len(test.t), dtype=bool)
+    while len(which := np.flatnonzero(turns & (test.n_relabelings < MOST))):
+        test.extend(count, which)
+        turns = turning()
         if time.monotonic() - begun > seconds:
-            return turns
+            break
         count = min(2 * count, MOST)
-    return turns if n_pairs else np.zeros(0, dtype=bool)
+    return turns
 
 
 def holm_levels(p: FloatArray, alpha: float) -> FloatArray:
@@ -101,6 +113,22 @@ def ratio_interval(
     return np.asarray(np.expm1(-ends[[0, 2, 1]] if swapped else ends))
 
 
+@functools.lru_cache(maxsize=64)  # a board asks for those of an entry in each of its pairs
+def _sums(
+    runs: tuple[int, ...], n_first: int, n_second: int, place: int, seed: int, chunks: int
+) -> FloatArray:
+    """Return, (2, labelings), sums of runs over their mean, and of their squares, over those labeled "first".
+
+    The runs are those of a pair's first (0) or second (1) entry. The labelings are all, or so many chunks.
+    """
+    side = np.array(runs) / np.mean(runs)
+    powers, part = np.stack([side, side**2]), slice(n_first, None) if place else slice(n_first)
+    if not chunks:
+        return np.asarray(powers @ all_labelings(n_first, n_second)[part])
+    made = (weights(n_first, n_second, seed, 0, chunk) for chunk in range(chunks))
+    return np.concatenate([powers @ each[part] for each in made], axis=1)
+
+
 class _Rescaled:
     """The relabeling test of a pair whose second entry is multiplied by a ratio.
 
@@ -112,17 +140,13 @@ class _Rescaled:
 
     def __init__(self, first: IntArray, second: IntArray, level: float, seed: int) -> None:
         self.level, self.sizes = level, (len(first), len(second))
-        self.own = 0  # labelings that are the data's own, or its reverse
-        if few_labelings(*self.sizes) is not None:
-            self.own = 1 + (len(first) == len(second))
-            labels = all_labelings(*self.sizes).astype(np.float64)
-        else:
-            chunks = min(_CHUNKS, math.ceil(_IN_TAIL / level / CHUNK))
-            made = [weights(*self.sizes, seed, 0, chunk) for chunk in range(chunks)]
-            labels = made[0] if chunks == 1 else np.concatenate(made, axis=1)
+        few = few_labelings(*self.sizes) is not None
+        # labelings that are the data's own, or its reverse
+        self.own = 1 + (len(first) == len(second)) if few else 0
+        chunks = 0 if few else min(_CHUNKS, math.ceil(_IN_TAIL / level / CHUNK))
+        runs = (tuple(each.tolist()) for each in (first, second))
+        self.sums = [_sums(each, *self.sizes, place, seed, chunks) for place, each in enumerate(runs)]
         sides = [np.stack([side, side**2]) for side in (first / first.mean(), second / second.mean())]
-        parts = labels[: len(first)], labels[len(first) :]
-        self.sums = [side @ part for side, part in zip(sides, parts, strict=True)]
         self.totals = [side.sum(axis=1, keepdims=True) for side in sides]
         self.ratio = math.log(first.mean() / second.mean())
         self.error = math.sqrt(float(self._test(self.totals[0], np.ones((2, 1)))[1][0]))
@@ -136,9 +160,8 @@ class _Rescaled:
         """Return the |t| beyond which a log ratio is rejected that differs by a shift from the estimate."""
         factors = np.exp([[shift], [2 * shift]])
         t = np.abs(studentized(*self._test(self.sums[0] + factors * self.sums[1], factors)))
-        others = (
-            t[1 : t.size - (self.own == 2)] if self.own else t
-        )  # the first is the data's own, the last its reverse
+        # the first is the data's own, the last its reverse
+        others = t[1 : t.size - (self.own == 2)] if self.own else t
         allowed = int(self.level * t.size) - self.own
         if allowed < 0:
             return math.inf

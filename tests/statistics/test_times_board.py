@@ -180,3 +180,19 @@ def test_equals_are_rarely_told_apart_and_seeds_decide() -> None:
     seeded = [times_board(entries, SURFACE, seed=seed).p for seed in (0, 0, 1)]
     assert np.array_equal(seeded[0], seeded[1], equal_nan=True)
     assert not np.array_equal(seeded[0], seeded[2], equal_nan=True)
+
+
+def test_a_pair_behind_one_that_holm_keeps_is_relabeled_while_it_may_come_first() -> None:
+    """Ten thousand relabelings put the second behind the first, which Holm keeps at .025; more put it below .025."""
+
+    class Scripted(MaxT):
+        def extend(self, n_relabelings: int, which: np.ndarray | None = None) -> None:
+            chosen = np.arange(2) if which is None else which
+            p = np.array([0.0275, 0.0285 if n_relabelings == CHUNK else 0.02])
+            self.n_relabelings[chosen] = n_relabelings
+            self.reached[chosen, 0] = np.rint(p * n_relabelings)[chosen]
+
+    generator = np.random.default_rng(5)
+    test = Scripted([tuple(generator.integers(50, 100, (2, 20, 1))) for _ in range(2)], ratio=True)  # type: ignore[misc]
+    assert not settle(test, 0.05).any()
+    assert test.p == pytest.approx([0.0275, 0.02])
