@@ -366,7 +366,7 @@ def pair_on(
         alone = times_pair(one, other, grid, board.alpha, board.horizon, seconds=_SECONDS)
         missing = any(row.entry.missing for row in rows)
         return PairVerdict(
-            labels, alone, thresholds, None, 0, whole=whole, before=grid.before, provisional=bool(missing)
+            labels, alone, thresholds, None, 0, whole=whole, before=grid.before, provisional=missing
         )
     times = TimesPair(
         n_runs=(board.n_runs[i], board.n_runs[j]),

@@ -52,8 +52,8 @@ TOGETHER = (
 )
 
 SENTENCES = {
-    "against_the_order", "left_out", "message", "notes", "problem", "promise", "refused", "remarks", "reports",
-    "sentence", "summary", "trade_offs", "words",
+    "left_out", "message", "notes", "problem", "promise", "refused", "remarks", "reports",
+    "sentence", "summary", "words",
 }  # fmt: skip
 OF_THE_MACHINE = {
     "basis", "complete_estimate", "core_hours_at_most", "core_hours_left", "core_hours_range", "core_hours_saved",
