@@ -181,7 +181,9 @@ def notes(module: ModuleType) -> list[str]:
     """Say of every network in a module that calls a QNode how it is trained faster."""
     found = []
     for cls in public(module):
-        codes = (getattr(each, "__code__", None) for each in vars(cls).values()) if kind_of(cls) else ()
+        if kind_of(cls) is not specs.ModelSpec:
+            continue
+        codes = (getattr(each, "__code__", None) for each in vars(cls).values())
         names = {name for code in codes if code is not None for name in code.co_names}
         qnodes = sorted(name for name in names if is_qnode(getattr(module, name, None)))
         if qnodes and not {"layer", "TorchLayer"} & names:  # `run` refuses a TorchLayer, in the same words
@@ -291,7 +293,8 @@ def _ansatz(function: Callable[..., Any], name: str, summary: str, holder: _Hold
             def build(qubits: int | None, layers: int, chosen: Any) -> Any:
                 own = functools.partial(call, options=chosen)
                 trace = specs.resolve("qrlsuite.circuit.tracing:trace")
-                return trace(function, qubits, layers, own, chosen.entangled == "mean-field")
+                mean_field = getattr(chosen, "entangled", True) == "mean-field"
+                return trace(function, qubits, layers, own, mean_field)
 
             if has_one_size(function):
                 qubits = build(None, 1, options()).qubits
@@ -417,7 +420,8 @@ def _signature(
     named, optional:
         Arguments by name: always, and if there is such a parameter.
     more:
-        Further options, where there is no such parameter: name, annotation, default.
+        Further options (name, annotation, default), where neither a parameter nor a dataclass of options is in their
+        place.
     """
     parameters = _parameters(thing)
     written = f"{thing.__name__}({', '.join([*first, *named, '...'])})"

@@ -227,12 +227,6 @@ class ModelSpec(NumericSpec):
         )
 
 
-def most_steps(environment_options: Mapping[str, Any]) -> int | None:
-    """Return the most steps of an episode, where an option of the environment says it."""
-    found: int | None = environment_options.get("max_episode_steps") or environment_options.get("steps")
-    return found
-
-
 @dataclass(frozen=True, slots=True)
 class AlgorithmSpec(NumericSpec):
     """A learning algorithm: one file with an options dataclass and a class (see `qrlsuite.algorithm`).
@@ -248,10 +242,10 @@ class AlgorithmSpec(NumericSpec):
     starting_values:
         Values of options that a task's preset leaves out, and those of the quick look `--task gym:ID`.
     unusable:
-        Reference to `unusable(options, epochs, rounds, environments) -> list[str]`: sentences on options (values by
-        name, and the most steps of an `episode`, None where unknown) that are of no use in a run of so many epochs,
-        each of so many rounds, steps of every one of a seed's
-        environments. Boards call it, so its module imports no torch. None says nothing.
+        Reference to `unusable(options, epochs, rounds, environments) -> list[str]`: sentences on options that are of no
+        use in a run of so many epochs. An epoch has `rounds` steps of each of a seed's `environments`. `options` are
+        the values by name, and as `episode` the most steps of an episode, None where unknown. Boards call it, so its
+        module imports no torch. None says nothing.
     """
 
     kind, kinds = "algorithm", "algorithms"
@@ -269,6 +263,20 @@ class AlgorithmSpec(NumericSpec):
             raise PluginError(
                 f"algorithm '{self.name}': actions = {self.actions!r} must name some of {', '.join(known)}, in a tuple"
             )
+
+    def useless(
+        self,
+        options: Mapping[str, Any],
+        environment_options: Mapping[str, Any],
+        epochs: int,
+        rounds: int,
+        environments: int,
+    ) -> list[str]:
+        """Return the sentences of `unusable` on a run; of an episode's length, by the environment's own option."""
+        if self.unusable is None:
+            return []
+        episode = environment_options.get("max_episode_steps") or environment_options.get("steps")
+        return list(resolve(self.unusable)({**options, "episode": episode}, epochs, rounds, environments))
 
 
 @dataclass(frozen=True, slots=True)

@@ -162,7 +162,7 @@ class PairVerdict:
         unseen = [n for n, failed in zip(pair.n_runs, pair.failed) if not failed and n < _UNSEEN]
         if unseen:
             clauses.append(
-                f"none of {min(unseen)} seeds failed, but up to {share_text(most_failures(min(unseen)))} may"
+                f"none of {min(unseen)} seeds failed, but up to {share_text(most_failures(min(unseen)))} of others may"
             )
         less, more = sorted(pair.spreads)
         if more and any(more >= factor * less and min(pair.n_runs) <= most for factor, most in _SPREADS):
@@ -175,7 +175,7 @@ class PairVerdict:
         share = self.times.detectable
         if math.isnan(share) or not share or self.adjusted:
             return ""
-        return f"; so many seeds show {share_text(share)} fewer in 4 of 5 cases"
+        return f"; so many seeds would show {share_text(share)} fewer in 4 of 5 cases"
 
     @property
     def _not_told_apart(self) -> str:

@@ -544,14 +544,14 @@ class EntryResults(Shown):
     def unusable(self) -> list[str]:
         """Settings of the algorithm that are of no use in the longest run as it was trained, however it is cut here."""
         registered = registry.load().of(specs.AlgorithmSpec)
-        reference = registered[self.algorithm].spec.unusable if self.algorithm in registered else None
-        if reference is None or not any(run.finished for run in self.records.values()):
+        if self.algorithm not in registered or not any(run.finished for run in self.records.values()):
             return []
         protocol, trained = self.task_file.protocol, max(run.epochs for run in self.records.values())
+        task = self.record.identity.task.get("environment_options", {})
         try:
-            episode = specs.most_steps(self.record.identity.task.get("environment_options", {}))
-            judge, own = specs.resolve(reference), {**self.options["algorithm"], "episode": episode}
-            return list(judge(own, trained, protocol.rounds, protocol.environments))
+            return registered[self.algorithm].spec.useless(
+                self.options["algorithm"], task, trained, protocol.rounds, protocol.environments
+            )
         except KeyError:
             return []  # an older record, without the option
 

@@ -313,12 +313,13 @@ class Angle:
         term: Callable[[int | Encoding], str],
         element: Callable[[Element], str] = str,
         number: Callable[[float], str] = repr,
-    ) -> tuple[list[str], list[str]]:
-        """Write the factors of the input term, and the weight if there is one, with functions that write each."""
+        times: str = "*",
+    ) -> list[str]:
+        """Write the input term and the weight, where there are such, with functions that write their parts."""
         factors = [number(float(self.times))] if self._has_term and self.times != 1.0 else []
         factors += [element(self.scale)] if self.scale else []
         factors += [term(each) for each in (self.input, self.factor) if each is not None]
-        return factors, [element(self.weight)] if self.weight else []
+        return [times.join(factors)] * bool(factors) + ([element(self.weight)] if self.weight else [])
 
     @property
     def product(self) -> Product | None:
@@ -767,7 +768,5 @@ def canonical(circuit: Circuit) -> str:
 
 def _written(angle: Angle) -> str:
     """Write an angle: its constant, and after a plus sign each, its inputs with their scale, and its weight."""
-    factors, weight = angle.texts(
-        lambda term: term.text(_written) if isinstance(term, Encoding) else f"x{term}"
-    )
-    return "+".join([repr(float(angle.constant)), *(["*".join(factors)] if factors else []), *weight])
+    terms = angle.texts(lambda term: term.text(_written) if isinstance(term, Encoding) else f"x{term}")
+    return "+".join([repr(float(angle.constant)), *terms])

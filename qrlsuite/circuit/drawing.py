@@ -20,11 +20,10 @@ BOX = {"facecolor": "white", "edgecolor": "black"}
 
 def angle_text(angle: Angle) -> str:
     """Write an angle as `constant + scale*input + weight`."""
-    factors, weight = angle.texts(
+    terms = angle.texts(
         lambda term: term.text(angle_text) if isinstance(term, Encoding) else f"x{term}",
         number="{:.4g}".format,
     )
-    terms = [*(["*".join(factors)] if factors else []), *weight]
     return " + ".join([*terms, *([f"{angle.constant:.4g}"] if angle.constant or not terms else [])])
 
 

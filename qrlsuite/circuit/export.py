@@ -53,8 +53,7 @@ def _formula(
         prefix = functions if term.function in FUNCTIONS else ""
         return prefix + term.text(lambda part: _formula(part, feature, element, functions))
 
-    factors, weight = angle.texts(factor, element)
-    terms = [*([" * ".join(factors)] if factors else []), *weight]
+    terms = angle.texts(factor, element, times=" * ")
     return " + ".join([*terms, *([repr(angle.constant)] if angle.constant or not terms else [])])
 
 

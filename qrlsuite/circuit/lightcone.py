@@ -9,15 +9,15 @@ may fail: Paulis are kept qubit by qubit, without their correlations.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from qrlsuite.circuit.description import Angle, Circuit, Element, Operation
-from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z, rotation
+from qrlsuite.circuit.description import Angle, Circuit, Element
+from qrlsuite.circuit.matrices import FIXED, ROTATIONS, Matrix, X, Y, Z, exponential
 from qrlsuite.errors import OptionError
 
 PAULIS: dict[str, Matrix] = {"I": np.eye(2, dtype=np.complex128), "X": X, "Y": Y, "Z": Z}
@@ -25,8 +25,9 @@ ANY = 0.7345
 """An angle that stands for any: no rotation by it maps a Pauli to another one."""
 
 Letters = frozenset[str]
-Step = tuple[str, float, bool, tuple[int, ...], Angle | None]
-"""A gate's name, angle (`ANY` for one that varies), whether its first qubit controls it, its qubits, and the angle."""
+Step = tuple[str, int, float, bool, tuple[int, ...], Angle | None]
+"""A gate or one of its `ROTATIONS`: the gate's name, the number of the rotation, its angle in radians (`ANY` for one
+that varies), whether the first qubit controls it, the qubits, and the angle if it varies."""
 
 
 class Use(NamedTuple):
@@ -100,50 +101,37 @@ def described(circuit: Circuit, build: Callable[[int], Circuit]) -> dict[str, st
 
 
 def _steps(circuit: Circuit) -> Iterator[Step]:
-    """Yield the gates as fixed gates and rotations about one axis, in order."""
+    """Yield the gates as fixed gates and exponentials of `ROTATIONS`, in order."""
     for operation in circuit:
         controlled = operation.control is not None
         if not operation.angles:
-            yield operation.gate, ANY, controlled, operation.qubits, None
-        for name, angle, qubits in _rotations(operation):
+            yield operation.gate, 0, ANY, controlled, operation.qubits, None
+        for number, (place, _) in enumerate(ROTATIONS.get(operation.gate, ())):
+            angle = operation.angles[place]
             value = ANY if angle.varies else angle.constant
-            yield name, value, len(qubits) > 1, qubits, angle if angle.varies else None
-
-
-def _rotations(operation: Operation) -> Iterator[tuple[str, Angle, tuple[int, ...]]]:
-    gate, qubits, angles = operation.gate, operation.qubits, operation.angles
-    if gate in ("RX", "RY", "RZ"):
-        yield gate, angles[0], qubits
-    elif angles:
-        order = (0, 1, 2) if gate == "Rot" else (2, 0, 1)  # U3 is a phase times Rot(delta, theta, phi)
-        for name, place in zip(("RZ", "RY", "RZ"), order):
-            yield name, angles[place], qubits
-        for place in (1, 2) if gate == "U3" and operation.control is not None else ():
-            yield "RZ", angles[place], qubits[:1]
+            yield operation.gate, number, value, controlled, operation.qubits, angle if angle.varies else None
 
 
 def _changed(steps: list[Step], letters: list[Letters]) -> list[bool]:
     """Return which steps change an operator with these Paulis on the qubits, moved through them."""
     letters, changes = list(letters), []
-    for name, angle, controlled, qubits, _ in steps:
-        after, changed = _image(name, angle, controlled, tuple(letters[q] for q in qubits))
+    for *step, qubits, _ in steps:
+        after, changed = _image(*step, tuple(letters[q] for q in qubits))
         for qubit, own in zip(qubits, after):
             letters[qubit] = own
         changes.append(changed)
     return changes
 
 
-@cache
+@functools.cache
 def _image(
-    name: str, angle: float, controlled: bool, letters: tuple[Letters, ...]
+    name: str, number: int, angle: float, controlled: bool, letters: tuple[Letters, ...]
 ) -> tuple[tuple[Letters, ...], bool]:
     """Return the Paulis on a gate's qubits behind it, and whether it changes any product of them.
 
     They are the same for the inverse of every gate here.
     """
-    gate: Any = FIXED.get(name)
-    if gate is None:
-        gate = rotation(PAULIS[name[1]], angle)
+    gate: Any = FIXED[name] if name in FIXED else exponential(ROTATIONS[name][number][1], angle)
     if controlled:
         gate = np.kron(np.diag([1, 0]), PAULIS["I"]) + np.kron(np.diag([0, 1]), gate)
     after: list[set[str]] = [set() for _ in letters]
@@ -160,7 +148,5 @@ def _image(
 
 
 def _product(word: Sequence[str]) -> Matrix:
-    matrix = PAULIS[word[0]]
-    for letter in word[1:]:
-        matrix = np.asarray(np.kron(matrix, PAULIS[letter]), dtype=np.complex128)
-    return matrix
+    matrices: Iterator[Any] = (PAULIS[letter] for letter in word)
+    return functools.reduce(np.kron, matrices)

@@ -1,4 +1,4 @@
-"""The matrices of Pauli and of the fixed gates of `qrlsuite.circuit.GATES`."""
+"""The matrices of Pauli, and those of the gates of `qrlsuite.circuit.GATES`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,19 @@ FIXED: dict[str, Matrix] = {
     "SWAP": np.eye(4, dtype=np.complex128)[[0, 2, 1, 3]],
 }
 
+ONE: Matrix = np.diag([0, 1]).astype(np.complex128)
+ROTATIONS: dict[str, tuple[tuple[int, Matrix], ...]] = {
+    "RX": ((0, X / 2),),
+    "RY": ((0, Y / 2),),
+    "RZ": ((0, Z / 2),),
+    "Rot": ((0, Z / 2), (1, Y / 2), (2, Z / 2)),
+    "U3": ((2, -ONE), (0, Y / 2), (1, -ONE)),
+}
+"""Gates with angles, as exp(-i angle G) in order of application: the place of the angle, and G."""
 
-def rotation(pauli: Matrix, angle: float) -> Matrix:
-    """Return exp(-i angle pauli / 2)."""
-    rotated: Matrix = np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
-    return rotated
+
+def exponential(generator: Matrix, angle: float) -> Matrix:
+    """Return exp(-i angle G) of a Hermitian matrix G."""
+    values, vectors = np.linalg.eigh(generator)
+    turned: Matrix = (vectors * np.exp(-1j * angle * values)) @ vectors.conj().T
+    return turned

@@ -72,6 +72,8 @@ def trace(
 
     Raises
     ------
+    PluginError
+        If `weight_shapes` lacks a weight.
     OptionError
         For a size that the function does not have.
     CircuitError
@@ -131,7 +133,14 @@ def trace(
 
 
 def _shape(name: str, shape: Any, qubits: int | None, layers: int) -> tuple[int, ...]:
-    """Return a shape as PennyLane's TorchLayer reads it, or that of its function for a size."""
+    """Return the shape of a weight.
+
+    Parameters
+    ----------
+    shape:
+        What `weight_shapes` has for it, as for PennyLane's TorchLayer: whole numbers, one number, or () or 1 for a
+        scalar; or a function of `qubits` and `layers` that returns one of these.
+    """
     try:
         if callable(shape):
             size = {"qubits": qubits, "n_wires": qubits, "layers": layers, "n_layers": layers}

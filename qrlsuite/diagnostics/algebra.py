@@ -17,17 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.circuit.description import Circuit
-from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
+from qrlsuite.circuit.matrices import FIXED, ONE, ROTATIONS, Matrix, exponential
 
-_ONE: Matrix = np.diag([0, 1]).astype(np.complex128)
-ROTATIONS: dict[str, tuple[tuple[int, Matrix], ...]] = {
-    "RX": ((0, X / 2),),
-    "RY": ((0, Y / 2),),
-    "RZ": ((0, Z / 2),),
-    "Rot": ((0, Z / 2), (1, Y / 2), (2, Z / 2)),
-    "U3": ((2, -_ONE), (0, Y / 2), (1, -_ONE)),
-}
-"""Gates with angles, as exp(-i angle G) in order of application: the place of the angle, and G."""
 SMALL = 1e-9
 """Of the squared length of a commutator with unit generators: shorter ones are rounding."""
 
@@ -42,12 +33,10 @@ def generators(circuit: Circuit) -> Matrix:
             before = _on(FIXED[operation.gate], operation.wires, n) @ before
             continue
         for place, own in ROTATIONS[operation.gate]:
-            whole = _on(own if operation.control is None else np.kron(_ONE, own), operation.qubits, n)
+            whole = _on(own if operation.control is None else np.kron(ONE, own), operation.qubits, n)
             angle = operation.angles[place]
             if not angle.varies:
-                values, vectors = np.linalg.eigh(whole)
-                turn = (vectors * np.exp(-1j * angle.constant * values)) @ vectors.conj().T
-                before = turn @ before
+                before = exponential(whole, angle.constant) @ before
                 continue
             whole = before.conj().T @ whole @ before
             found.append(whole - np.eye(1 << n) * (np.trace(whole) / (1 << n)))

@@ -179,13 +179,9 @@ class Entry:
 
     def unusable(self, epochs: int) -> list[str]:
         """Name settings of the algorithm that are of no use in a run of so many epochs, by its own account."""
-        protocol = self.task.file.protocol
-        if self.algorithm.unusable is None:
-            return []
+        protocol, task = self.task.file.protocol, options.plain(self.task.environment_options)
         own = options.plain(self.algorithm_options)
-        own["episode"] = specs.most_steps(options.plain(self.task.environment_options))
-        judge = specs.resolve(self.algorithm.unusable)
-        return list(judge(own, epochs, protocol.rounds, protocol.environments))
+        return self.algorithm.useless(own, task, epochs, protocol.rounds, protocol.environments)
 
     def distributions(self) -> list[str]:
         """Return the distributions whose code makes the entry's numbers, each once."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.circuit import Angle, Circuit, Operation
 from qrlsuite.circuit.description import FUNCTIONS, Encoding
-from qrlsuite.circuit.matrices import FIXED, Matrix, Y, Z, rotation
+from qrlsuite.circuit.matrices import FIXED, Matrix, Y, Z
 
 
 def expectation_values(
@@ -77,13 +77,19 @@ def _feature(term: int | Encoding | None, inputs: NDArray[np.float64]) -> float:
     return sum(values) if term.function == "sum" else math.prod(values)
 
 
+def _rotation(pauli: Matrix, angle: float) -> Matrix:
+    """Return exp(-i angle pauli / 2)."""
+    rotated: Matrix = np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
+    return rotated
+
+
 def _matrix(operation: Operation, angles: list[float]) -> Matrix:
     """Return the matrix of an operation on (control, wires): 2 x 2 or 4 x 4."""
     gate = operation.gate
     if gate in ("RX", "RY", "RZ"):
-        matrix = rotation(FIXED[gate[1]], angles[0])
+        matrix = _rotation(FIXED[gate[1]], angles[0])
     elif gate == "Rot":
-        matrix = rotation(Z, angles[2]) @ rotation(Y, angles[1]) @ rotation(Z, angles[0])
+        matrix = _rotation(Z, angles[2]) @ _rotation(Y, angles[1]) @ _rotation(Z, angles[0])
     elif gate == "U3":
         t, p, d = angles
         matrix = np.array(

@@ -54,10 +54,11 @@ class TuneDisplay:
                 f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
             ]
             options_class = specs.resolve(base.algorithm.options)
-            if request.grid is None and not request.varied and not tuned(options_class):
+            names = field_names(options_class)
+            if names and request.grid is None and not request.varied and not tuned(options_class):
                 lines.append(
-                    f"  {base.algorithm.name} marks no option for tuning ({listed(field_names(options_class))}): write "
-                    "--vary 'lr={low=1e-4, high=1e-2, log=true}', or mark it, lr: Annotated[float, Tuned(1e-4, 1e-2)]"
+                    f"  {base.algorithm.name} marks no option for tuning ({listed(names)}): write --vary "
+                    "'NAME={low=1e-4, high=1e-2, log=true}', or mark it, NAME: Annotated[float, Tuned(1e-4, 1e-2)]"
                 )
             self.console.print("\n".join(lines), markup=False)
         cores, known = self.where.workers, [cost for cost in costs if cost is not None]

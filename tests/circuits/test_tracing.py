@@ -184,7 +184,8 @@ def test_the_function_on_the_page_is_an_ansatz_of_every_size(tmp_path: Path) -> 
         assert circuit.parameters["weights"].shape == (layers, qubits, 3)
 
 
-HEAD = """import math
+HEAD = """import dataclasses
+import math
 import numpy as np
 import pennylane as qml
 
@@ -227,6 +228,17 @@ def test_a_qnode_in_a_file_is_an_ansatz_of_its_own_size(tmp_path: Path) -> None:
 
 
 FORMS = """
+@dataclasses.dataclass
+class Options:
+    turns: int = 1
+
+
+def chosen(inputs, weights, options: Options = Options()):
+    for _ in range(options.turns):
+        embed(inputs, range(3))
+    return qml.expval(qml.Z(0))
+
+
 def embed(inputs, wires):
     qml.AngleEmbedding(inputs, wires=wires)
 
@@ -274,6 +286,7 @@ def test_each_way_to_write_a_quantum_function_and_its_helpers(tmp_path: Path) ->
     own.load(file)
     circuits = {name: ansatz(name, 3, 1) for name in ("behind", "bare", "reads")}
     assert [(each.qubits, each.inputs) for each in circuits.values()] == [(3, 3), (3, 3), (3, 30)]
+    assert len(ansatz("chosen", 3, 1, turns=2)) == 6
     assert ansatz("named", 3, 1).inputs == 3
     assert ansatz("named", 3, 1).observables == (0,)
     for helper in ("embed", "block", "wired"):
@@ -299,36 +312,36 @@ def test_a_shape_that_is_none_says_how_one_is_written(shape: Any, monkeypatch: p
     [
         (
             {"line": "qml.RX(weights[0] * weights[1], wires=0)"},
-            "products of parameters: .*own .*line 13: qml.RX",
+            "products of parameters: .*own .*line 14: qml.RX",
         ),
         (
             {"line": "qml.RX(np.tanh(weights[0]), wires=0)"},
             "tanh of a parameter: functions take inputs alone",
         ),
-        ({"line": "qml.RX(math.atan(x[0]), wires=0)"}, r"np.arctan\(x\), not math.atan.* \(mine.py, line 13"),
+        ({"line": "qml.RX(math.atan(x[0]), wires=0)"}, r"np.arctan\(x\), not math.atan.* \(mine.py, line 14"),
         (
             {"line": "qml.measure(0, postselect=1)"},
             "[Pp]ostselect.*no run may be thrown away",
         ),
         ({"line": "qml.RX(x[:, 0], wires=0)"}, "too many indices .*symbols for one sample"),
-        ({"line": "qml.RX(x, wires=0)"}, "RX cannot be taken: an array is its angle.*line 13"),
+        ({"line": "qml.RX(x, wires=0)"}, "RX cannot be taken: an array is its angle.*line 14"),
         ({"line": "x[0] > 0 and qml.X(0)"}, "'>' not supported .*let no gate or shape depend on a value"),
         (
             {"line": "qml.DepolarizingChannel(0.1, wires=0)"},
-            "DepolarizingChannel cannot be taken: .*line 13",
+            "DepolarizingChannel cannot be taken: .*line 14",
         ),
         ({"line": "qml.X(2)"}, "'swirl' uses the wire 2, which its device does not have"),
         (
             {"line": "qml.RX(x[0] - weights[1], wires=0)"},
-            r"without numbers before it.* RX\(a\), RX\(b\).*line 13",
+            r"without numbers before it.* RX\(a\), RX\(b\).*line 14",
         ),
         (
             {"line": "qml.IsingXY(x[0] + weights[0], wires=[0, 1])"},
-            "a sum of an input and a parameter cannot.*line 13",
+            "a sum of an input and a parameter cannot.*line 14",
         ),
         (
             {"line": "qml.RX(weights[5], wires=0)"},
-            "no circuit of this size: index 2 is out of bounds for axis 0 with size 2 .*line 12",
+            "no circuit of this size: index 2 is out of bounds for axis 0 with size 2 .*line 13",
         ),
         ({"returned": "qml.probs(wires=0)"}, "return expval of Z, X, Y or products"),
         ({"returned": "qml.expval(qml.Z(0) + qml.Z(1))"}, "of a sum return the terms"),

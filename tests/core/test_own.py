@@ -478,6 +478,7 @@ def test_a_network_that_calls_a_qnode_is_told_what_to_do() -> None:
         write(
             "net.py",
             """
+            import gymnasium
             import pennylane as qml
             import torch
 
@@ -504,6 +505,11 @@ def test_a_network_that_calls_a_qnode_is_told_what_to_do() -> None:
             class Torch(torch.nn.Sequential):
                 def __init__(self, inputs, outputs):
                     super().__init__(torch.nn.Linear(inputs, 2), qml.qnn.TorchLayer(swirl, weight_shapes))
+
+
+            class Chamber(gymnasium.Env):  # no network
+                def reset(self, *, seed=None, options=None):
+                    return swirl([0, 0], [0, 0])
             """,
         )
     )

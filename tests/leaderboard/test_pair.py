@@ -46,7 +46,7 @@ def test_the_helpers_are_right_by_hand() -> None:
 def test_the_first_is_the_subject_in_sentence_and_table() -> None:
     """M of 20 and 40 epochs, with half an epoch: 40.5 / 20.5 - 1."""
     fast, slow = entry("fast", spread(18)), entry("slow", spread(38))
-    unseen = "; none of 30 seeds failed, but up to 9.5% may"
+    unseen = "; none of 30 seeds failed, but up to 9.5% of others may"
     there, back = compare_entries(fast, slow), compare_entries(slow, fast)
     assert (
         there.verdict
@@ -81,7 +81,7 @@ def test_the_verdict_is_that_of_the_mean_whatever_a_threshold_says() -> None:
     assert compared.verdict.startswith(
         "not told apart: first needs 4.7% more steps than second, 11% fewer to 23%"
     )
-    assert compared.verdict.endswith("; so many seeds show 21% fewer in 4 of 5 cases")
+    assert compared.verdict.endswith("; so many seeds would show 21% fewer in 4 of 5 cases")
     assert [row[-1] for row in compared.pair.rows()].count("fewer") == 1
 
 
@@ -91,11 +91,13 @@ def test_what_so_few_seeds_cannot_know_is_a_clause() -> None:
     wide = entry("wide", np.resize([2, 96], 20))
     said = compare_entries(wide, entry("narrow", spread(5, 20))).verdict
     assert said.startswith("wide needs 560% more steps than narrow (")
-    assert said.endswith("; none of 20 seeds failed, but up to 14% may; one entry's seeds vary 5 times as much as the "
-                         "other's, which so few seeds can mistake for a difference")  # fmt: skip
+    assert said.endswith(
+        "; none of 20 seeds failed, but up to 14% of others may; one entry's seeds vary 5 times as much as the "
+        "other's, which so few seeds can mistake for a difference"
+    )
     failing = entry("failing", [18, 20, 100, 19, 22])
     assert (
-        "; none of 8 seeds failed, but up to 31% may"
+        "; none of 8 seeds failed, but up to 31% of others may"
         in compare_entries(failing, entry("quick", spread(2, 8))).verdict
     )
 
@@ -117,7 +119,7 @@ def test_equals_are_not_told_apart_and_too_few_cannot_decide() -> None:
     first, second = entry("first", spread(20)), entry("second", spread(20))
     assert compare_entries(first, second).verdict == (
         "not told apart: first needs 0.0% fewer steps than second, 3.3% fewer to 3.4% more (30 seeds each, p = 1); "
-        "so many seeds show 4.6% fewer in 4 of 5 cases"
+        "so many seeds would show 4.6% fewer in 4 of 5 cases"
     )
     few = compare_entries(entry("few", spread(20, 3)), second)
     assert few.verdict == (

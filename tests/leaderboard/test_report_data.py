@@ -179,6 +179,8 @@ def test_the_command_writes_a_page(tmp_path: Path, train: Train) -> None:
     result = say("leaderboard", "--runs", str(folder), "--format", "html")
     assert result.stdout == f"wrote {folder / 'leaderboard.html'}\n"
     assert "<h1>Leaderboard</h1>" in (folder / "leaderboard.html").read_text()
+    both = boards.refused("leaderboard", "--runs", folder, "--format", "csv", "--out", "page.html")
+    assert both.endswith("--out page.html, which is html: give one of them")
     say("leaderboard", "--runs", str(folder), "--out", str(folder / "page.html"))
     assert "<h1>Leaderboard</h1>" in (folder / "page.html").read_text()
 

@@ -118,9 +118,13 @@ def leaderboard(
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
-    format_ = format_ if output is None else ENDINGS.get(output.suffix, format_)
-    if output is not None and format_ == "table":
-        raise OptionError(f"--out {output}: end it with {', '.join(ENDINGS)}")
+    if output is not None:
+        ending = ENDINGS.get(output.suffix, format_)
+        if ending == "table":
+            raise OptionError(f"--out {output}: end it with {', '.join(ENDINGS)}")
+        if format_ not in ("table", ending):
+            raise OptionError(f"--format {format_} and --out {output}, which is {ending}: give one of them")
+        format_ = ending
     tasks = list(task or ())
 
     asked: dict[str, Any] = {
