@@ -148,5 +148,5 @@ def _image(
 
 
 def _product(word: Sequence[str]) -> Matrix:
-    matrices: Iterator[Any] = (PAULIS[letter] for letter in word)
-    return functools.reduce(np.kron, matrices)
+    product: Matrix = functools.reduce(np.kron, (PAULIS[letter] for letter in word))  # type: ignore[arg-type]
+    return product
