@@ -18,16 +18,18 @@ With `--device cuda`: the native simulator on a GPU, 100 seeds together (50 of 1
 against one core of the machine that the GPU is in.
 
 Work: the paper's hybrid circuit (`iqp`, `rot`, 4 layers), gradients by inputs, scalings and weights. Peers are
-PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), the native simulator as
-a PennyLane device, lightning.qubit with adjoint gradients, Qiskit (values by Aer, native gradients) and JAX, jit and
-vmap, written by hand (`pip install jax`). Figures are medians of processor time: on shared cores the clock charges
-long calls for their neighbors, and short ones not, which would flatter the faster side. Ratios are to PennyLane's
-default.qubit.
+PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), the native simulator
+as a PennyLane device, lightning.qubit with adjoint gradients, Qiskit (values by Aer, native gradients), JAX by hand
+and TensorCircuit-NG, both by jit and vmap, and qulacs, whose backprop takes one sample (`pip install '.[bench]'`).
+Figures are medians of processor time: on shared cores the clock charges long calls for their neighbors, and short
+ones not, which would flatter the faster side. Ratios are to PennyLane's default.qubit.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
+import importlib.util
 import os
 import statistics
 import time
@@ -71,32 +73,35 @@ def torch_call(
     return lambda: run(x, parameters).backward(cotangent)
 
 
-def jax_call(qubits: int, layers: int) -> Call:
-    """Return the same pass in JAX: one sample's circuit by hand, vmap over the batch, jit over all."""
+def jax_call(qubits: int, layers: int, library: str = "") -> Call:
+    """Return the same pass in JAX: a sample's circuit by hand or by a library, vmap over the batch, jit over all."""
     import jax
     import jax.numpy as jnp
 
     n = qubits
+    if library:
+        import tensorcircuit
+
+        tensorcircuit.set_backend("jax")
 
     def rot(a: object) -> object:
         p, t, o = a[0], a[1], a[2]
         c, s = jnp.cos(t / 2), jnp.sin(t / 2)
-        return jnp.array(
-            [
-                [jnp.exp(-0.5j * (p + o)) * c, -jnp.exp(0.5j * (p - o)) * s],
-                [jnp.exp(-0.5j * (p - o)) * s, jnp.exp(0.5j * (p + o)) * c],
-            ]
-        )
+        rows = [
+            [jnp.exp(-0.5j * (p + o)) * c, -jnp.exp(0.5j * (p - o)) * s],
+            [jnp.exp(-0.5j * (p - o)) * s, jnp.exp(0.5j * (p + o)) * c],
+        ]
+        return jnp.array(rows).astype(jnp.complex64)
 
     hadamard = jnp.array([[1, 1], [1, -1]]) / jnp.sqrt(2.0)
 
-    def one(x: object, scaling: object, weights: object) -> object:
+    def by_hand(x: object, scaling: object, weights: object) -> object:
         state = jnp.full((2,) * n, 2.0 ** (-n / 2), dtype=jnp.complex64)
         for layer in range(layers):
             for q in range(n):
                 target = (q + 1) % n
                 state = jnp.moveaxis(state, (q, target), (0, 1))
-                u = rot(scaling[layer, q] * x[q] + weights[layer, q]).astype(jnp.complex64)
+                u = rot(scaling[layer, q] * x[q] + weights[layer, q])
                 state = jnp.stack([state[0], jnp.tensordot(u, state[1], axes=1)])
                 state = jnp.moveaxis(state, (0, 1), (q, target))
             if layer < layers - 1:
@@ -106,6 +111,18 @@ def jax_call(qubits: int, layers: int) -> Call:
         marginals = [probability.sum(axis=tuple(k for k in range(n) if k != q)) for q in range(n)]
         return jnp.array([m[0] - m[1] for m in marginals])
 
+    def by_tensorcircuit(x: object, scaling: object, weights: object) -> object:
+        circuit = tensorcircuit.Circuit(n)
+        for layer in range(layers):
+            for q in range(n):
+                circuit.h(q)
+            for q in range(n):
+                u = rot(scaling[layer, q] * x[q] + weights[layer, q])
+                circuit.unitary(q, (q + 1) % n, unitary=jnp.eye(4, dtype=jnp.complex64).at[2:, 2:].set(u))
+        return jnp.array([jnp.real(circuit.expectation_ps(z=[q])) for q in range(n)])
+
+    one = by_tensorcircuit if library else by_hand
+
     def loss(x: object, scaling: object, weights: object, cotangent: object) -> object:
         return (jax.vmap(one, in_axes=(0, None, None))(x, scaling, weights) * cotangent).sum()
 
@@ -114,6 +131,43 @@ def jax_call(qubits: int, layers: int) -> Call:
     x, cotangent = jax.random.normal(keys[0], (BATCH, n)), jax.random.normal(keys[1], (BATCH, n))
     scaling, weights = (6.28 * jax.random.uniform(k, (layers, n, 3)) for k in keys[2:])
     return lambda: jax.block_until_ready(gradient(x, scaling, weights, cotangent))
+
+
+def qulacs_call(qubits: int, layers: int) -> Call:
+    """Return the same pass in qulacs, sample by sample: a controlled rotation is one by P and one by ZP."""
+    from qulacs import Observable, ParametricQuantumCircuit
+
+    n, source = qubits, np.random.default_rng(0)
+    circuit = ParametricQuantumCircuit(n)
+    for _ in range(layers):
+        for q in range(n):
+            circuit.add_H_gate(q)
+        for q in range(n):
+            target = (q + 1) % n
+            for pauli in (3, 2, 3):
+                circuit.add_parametric_multi_Pauli_rotation_gate([target], [pauli], 0.0)
+                circuit.add_parametric_multi_Pauli_rotation_gate([q, target], [3, pauli], 0.0)
+    x, cotangent = source.normal(size=(2, BATCH, n))
+    scaling, weights = 6.28 * source.random((2, layers, n, 3))
+
+    def call() -> None:
+        gradients = np.empty((BATCH, layers, n, 3))
+        for sample in range(BATCH):
+            angles = scaling * x[sample, :, None] + weights
+            for place, angle in enumerate(np.stack([-angles / 2, angles / 2], axis=-1).ravel().tolist()):
+                circuit.set_parameter(place, angle)
+            observable = Observable(n)
+            for q in range(n):
+                observable.add_operator(cotangent[sample, q], f"Z {q}")
+            slopes = np.reshape(circuit.backprop(observable), (layers, n, 3, 2))
+            gradients[sample] = (slopes[..., 1] - slopes[..., 0]) / 2
+        _ = (
+            (gradients * scaling).sum(axis=(1, 3)),
+            (gradients * x[:, None, :, None]).sum(axis=0),
+            gradients.sum(axis=0),
+        )
+
+    return call
 
 
 def median_ms(call: Call, seconds: float, scale: float = 1.0) -> float:
@@ -329,10 +383,19 @@ def main() -> None:
             if n <= 10:
                 peers["Qiskit Aer"] = (torch_call(circuit, "qiskit", torch.float64), 1.0)
             if n <= 12 and (arguments.ansatz, arguments.gate) == ("iqp", "rot"):
-                try:
-                    peers["JAX jit + vmap"] = (jax_call(n, arguments.layers), 1.0)
-                except ImportError:
-                    print("JAX is not installed (pip install jax): left out")
+                for name, package, make in (
+                    ("JAX jit + vmap", "jax", jax_call),
+                    (
+                        "TensorCircuit-NG",
+                        "tensorcircuit",
+                        functools.partial(jax_call, library="tensorcircuit"),
+                    ),
+                    ("qulacs backprop", "qulacs", qulacs_call),
+                ):
+                    if importlib.util.find_spec(package) is None:
+                        print(f"{name} is not installed (pip install '.[bench]'): left out")
+                    else:
+                        peers[name] = make(n, arguments.layers), 1.0
         for name, (call, scale) in peers.items():
             table.setdefault(name, {})[n] = median_ms(call, arguments.seconds, scale)
             print(f"  n = {n}: {name} {table[name][n]:.3f} ms", flush=True)
