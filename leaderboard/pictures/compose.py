@@ -96,10 +96,10 @@ def compose(
         ]
     if not entries:
         selected.sort(key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
-        selected = [replace(entry, color=place) for place, entry in enumerate(selected)]
         if cuts:
             selected, short = collect.equally_long(selected)
             left_out += short
+        selected = [replace(entry, color=place) for place, entry in enumerate(selected)]
     held = sorted({entry.task for entry in selected})
     if not selected:
         raise UnknownNameError(

@@ -28,8 +28,8 @@ class EntryView:
 
     Attributes
     ----------
-    color:
-        Number of the entry's color and pattern in every section and picture of the page.
+    palette:
+        Numbers of the colors of its task's entries by name: who is asked first has the first.
     legend:
         The label, with the ansatz if there is one.
     facts:
@@ -43,11 +43,16 @@ class EntryView:
     index: int
     curves: EntryResults
     label: str
-    color: int
+    palette: dict[str, int]
     legend: str
     facts: tuple[tuple[str, str], ...]
     commands: tuple[tuple[str, str], ...]
     options: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
+
+    @property
+    def color(self) -> int:
+        """Number of its color and pattern in every section and picture of the page."""
+        return self.palette.setdefault(self.curves.name, len(self.palette))
 
     @property
     def quantum(self) -> bool:
@@ -58,16 +63,13 @@ class EntryView:
 def views(entries: Sequence[EntryResults]) -> list[EntryView]:
     """Return the entries of a page, labels made harmless and unique within a task."""
     labels = [(entry.task, clean(entry.label)) for entry in entries]
-    names: dict[str, dict[str, int]] = {}
-    for entry in entries:  # one at two horizons may be two objects
-        own = names.setdefault(entry.task, {})
-        own.setdefault(entry.name, len(own))
+    palettes: dict[str, dict[str, int]] = {entry.task: {} for entry in entries}
     return [
         EntryView(
             index=index,
             curves=entry,
             label=label if labels.count((task, label)) == 1 else clean(f"{label} ({entry.name})"),
-            color=names[task][entry.name],
+            palette=palettes[task],
             legend=clean(
                 entry.legend if labels.count((task, label)) == 1 else f"{entry.legend} ({entry.name})"
             ),
@@ -81,16 +83,17 @@ def views(entries: Sequence[EntryResults]) -> list[EntryView]:
 
 def _facts(entry: EntryResults) -> list[tuple[str, str]]:
     classical, quantum = entry.parameters
+    counts = f"{classical:,} classical, {quantum:,} quantum{entry.fixed_text}{_networks(entry)}"
     return [
         ("Name", clean(entry.name)),
         ("Algorithm", clean(entry.algorithm)),
         ("Model", clean(entry.model)),
-        ("Parameters", f"{classical:,} classical, {quantum:,} quantum{entry.fixed_text}{_networks(entry)}"),
+        ("Parameters", "" if entry.parameters_text() == "-" else counts),
         ("Agents", f"of {counted(len(entry.agents), 'seed')}" if entry.agents else ""),
         ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
-        ("Core-hours", hours_text(entry.hours)),
+        ("Core-hours", hours_text(entry.hours) if entry.hours else ""),
         ("Circuit executions", _told(entry.executions)),
         ("Preset", _told(entry.preset)),
         ("Versions", _told(entry.versions)),

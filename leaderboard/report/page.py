@@ -72,6 +72,7 @@ def render(
             date=f"{now.day} {now:%B %Y}",
             outcome=winners.outcome(view.winners for view in main),
             main=main,
+            heads=list(dict.fromkeys(head for view in main for head, row in view.winners.cells if row)),
             extent=sections.extent(boards, shown),
             sections=boards,
             entries=shown,

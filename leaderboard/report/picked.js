@@ -23,13 +23,13 @@
     let picked = panel.dataset.picked.split(" ").map(Number);
     let picture = null;
 
-    const words = element("div", { class: "verdicts", "aria-live": "polite" });
+    const words = panel.querySelector(".verdicts");
     const plot = element("div", { class: "plot", tabindex: 0, role: "img" });
     const legend = element("ul", { class: "legend" });
     const singles = element("input", { type: "checkbox" });
     const save = element("button", { type: "button", class: "save" }, "Save as SVG");
     const step = element("span", { class: "at" });
-    panel.append(words, plot, legend, element("p", { class: "tools" }, step, element("label", {}, singles, "Single runs"), save),
+    panel.append(plot, legend, element("p", { class: "tools" }, step, element("label", {}, singles, "Single runs"), save),
       element("p", { class: "note thinned" }));
 
     const boxes = rows.map((row, place) => {
@@ -180,7 +180,6 @@
       });
     }
 
-    panel.hidden = false;
     if (cells) cells.hidden = false;
     mark(picked);
     states.push({

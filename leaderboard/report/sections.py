@@ -107,6 +107,9 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     surfaces = tuple(surface(judgement.own(place), ranking) for place in range(len(rows)))
     winning = winners(rows, section.times)
     asked = winning.asked(rows)
+    picked = sorted({row.place for pair in asked for row in pair} or {row.place for row in rows[:3]})
+    for place in picked:  # the first colors differ most
+        _ = rows[place].entry.color
     return SectionView(
         id=f"board-{number}",
         number=number,
@@ -119,15 +122,17 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         answers=tuple(_verdict(section, grid, *pair, kinds=len(asked) < 3) for pair in asked),
         winners=winning,
         citation=cite(section, rows),
-        picked=tuple(
-            sorted({row.place for pair in asked for row in pair} or {row.place for row in rows[:3]})
-        ),
+        picked=tuple(picked),
         sentences=tuple(
             (one.place, other.place, _verdict(section, grid, one, other))
             for one, other in itertools.combinations(rows, 2)
         ),
         rows=rows,
-        columns=tuple(each for each in (*columns.ranks(section), *columns.facts(section)) if each.shown),
+        columns=tuple(
+            each
+            for each in (*columns.ranks(section), *columns.facts(section))
+            if each.shown and (each.name == "ranks" or any(each.written(row) != "-" for row in section.rows))
+        ),
         notes=tuple(tables.notes(section, by_tiers=False)),
         tier_columns=tier_columns,
         tier_notes=(
@@ -177,6 +182,8 @@ def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
     best, relation = ranked[0], times.board.outperforms
     if times.n_ranked == 1:
         return f"{best.name} is the only ranked entry."
+    if times.n_ranked == len(rows) == 2:
+        return ""  # the verdict says it
     if not relation.any():
         return f"No entry of {times.n_ranked} outperforms another."
     first = [row for row in ranked if row.time.ranks is not None and row.time.ranks[0] == 1]
@@ -257,7 +264,5 @@ def extent(sections: Sequence[SectionView], entries: Sequence[EntryView]) -> str
     tasks = {view.section.task for view in sections}
     runs = sum(len(entry.curves.seeds) for entry in entries)
     hours = sum(entry.curves.hours for entry in entries)
-    return (
-        f"{counted(len(entries), 'entry')} on {counted(len(tasks), 'task')}, "
-        f"{counted(runs, 'run')}, {hours_text(hours)} core-hours"
-    )
+    told = f"{counted(len(entries), 'entry')} on {counted(len(tasks), 'task')}, {counted(runs, 'run')}"
+    return told + f", {hours_text(hours)} core-hours" * bool(hours)

@@ -46,9 +46,9 @@ class Winners:
         """Return the pairs to show first, the entry with fewer steps first.
 
         Up to three ranked entries make all pairs. More entries: the best circuit with the best network and with the
-        network of its size, or the first and the last if there is only one kind.
+        network of its size, or the first and the last if there is only one kind. Where none is ranked, all count.
         """
-        ranked = _ranked(rows)
+        ranked = _ranked(rows) or list(rows)
         if len(ranked) <= 3:
             return list(itertools.combinations(ranked, 2))
         if self.circuit is None or self.network is None or self.sized is None:

@@ -22,6 +22,7 @@ from qrlsuite.leaderboard.report import encode, entries, ladder, render, section
 from qrlsuite.leaderboard.report.judge import judge
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.options import parse_setting
+from qrlsuite.results.records import ImportedRecord
 from qrlsuite.statistics import Outcome, Verdict, compare
 from tests.commands import say
 from tests.conftest import Train
@@ -168,6 +169,21 @@ def test_the_page_names_no_other_place_but_the_paper() -> None:
     }
     assert "@import" not in without_scripts
     assert "url(" not in without_scripts
+
+
+def test_a_page_of_curves_of_others_has_no_empty_columns_and_no_parameters() -> None:
+    unknown = {"imported": ImportedRecord(), "parameters": {"classical": 0, "quantum": 0}, "seconds": 0.0}
+    entries = [
+        boards.changed(boards.entry(name, task=task, speed=speed), **unknown)
+        for task in ("beam6g", "cartpole")
+        for name, speed in (("a", 1), ("b", 2), ("c", 3))
+    ]
+    page = render(boards.of(entries))
+    heads = set(re.findall(r'<th role="columnheader"[^>]*>([^<]*)', page))
+    assert {"Best entry", "Vs. first", "Final score", "Seeds"} <= heads
+    assert not heads & {"Best circuit", "Network nearest in size", "Core-hours", "Parameters", "Settings"}
+    shown = page.partition("<main")[0] + page.partition('id="entries"')[2].partition("</main>")[0]
+    assert not re.findall(r"0 parameters|0 core-hours|0 classical|Core-hours", shown)
 
 
 def test_an_empty_board_is_still_a_page() -> None:

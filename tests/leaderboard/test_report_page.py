@@ -81,7 +81,7 @@ def test_the_page_begins_with_the_boards_verdict(opened: Open) -> None:
         "vqc qubits=3": (0.7, 9),
     }
     entries = [boards.entry(label, speed=speed, quantum=q) for label, (speed, q) in speeds.items()]
-    tab = opened(boards.of(entries), 390)
+    tab = opened(boards.of([*entries, boards.entry("pole", task="cartpole")]), 390)
     alone = compare_entries(entries[0], entries[2]).verdict
     assert alone.startswith("mlp width=16 needs ")
     words = "classical mlp width=16 needs", "than quantum vqc qubits=4"
@@ -94,24 +94,23 @@ def test_the_page_begins_with_the_boards_verdict(opened: Open) -> None:
 
 
 def test_a_board_of_three_begins_with_every_pair(opened: Open) -> None:
-    tab = opened(boards.of([boards.entry(f"at {speed}", speed=speed) for speed in (3, 1.5, 0.5)]))
-    said = [text.partition(" (")[0] for text in tab.locator(".answers .said span").all_inner_texts()]
+    tab = opened(boards.of([boards.entry(f"at {speed}", speed=speed) for speed in (3, 1.5, 0.5)]), 390)
+    verdicts = tab.locator("#board-0 .verdict")
+    said = [text.partition(" (")[0] for text in verdicts.all_inner_texts()]
     assert [re.sub(r"\d+%", "n%", line) for line in said] == [
         "at 3 needs n% fewer steps than at 1.5",
         "at 3 needs n% fewer steps than at 0.5",
         "at 1.5 needs n% fewer steps than at 0.5",
     ]
-    assert (
-        tab.locator("#board-0 .verdicts .verdict").all_inner_texts()
-        == tab.locator(".answers .said span").all_inner_texts()
-    )
+    assert [tab.locator("body").inner_text().count(line) for line in said] == [1, 1, 1]
+    assert verdicts.first.bounding_box()["y"] < 500, "on a phone, without scrolling"
 
 
 def test_what_another_program_trained_is_neither_classical_nor_quantum(opened: Open) -> None:
     entries = [boards.entry(f"at {speed}", speed=speed, quantum=9 * (speed == 1)) for speed in (3, 2, 1, 0.5)]
     tab = opened(boards.of([boards.changed(entries[0], imported=ImportedRecord()), *entries[1:]]))
     assert "external" in tab.locator("#board-0-table tbody tr").first.inner_text()
-    assert tab.locator(".answers .said span").inner_text().startswith("classical at 2 needs ")
+    assert tab.locator("#board-0 .verdict").first.inner_text().startswith("at 2 needs ")
     assert "Curves that other programs made" in tab.locator("#board-0-notes").inner_text()
 
 
@@ -250,7 +249,7 @@ def test_hostile_names_stay_text(opened: Open) -> None:
     for place in places:
         text = tab.locator(place).inner_text()
         assert [name for name in seen if name not in text] == []
-    text = str(tab.locator("[data-sentences]").text_content()) + tab.locator(".answers").inner_text()
+    text = str(tab.locator("[data-sentences]").text_content())
     assert [name for name in seen if name not in text] == []
     for one in range(len(seen) - 1):
         tab.locator("#board-0 .matrix tbody tr").nth(one).locator("td").nth(one + 1).click()
@@ -266,6 +265,7 @@ def test_without_javascript_everything_is_there_and_printed(opened: Open, page: 
     assert {part: tab.locator(f"#board-0{part}").count() for part in parts} == parts
     assert tab.locator("#board-0 .matrix tbody td").count() == 25
     assert "model-0" in tab.locator("#board-0-table tbody").inner_text()
+    assert "model-0 width=1 needs " in tab.locator("#board-0 .verdict").inner_text()
     assert not tab.locator("#theme").is_visible()
     assert not tab.locator(".facts").first.is_visible()
     tab.emulate_media(media="print")
@@ -302,6 +302,24 @@ def test_no_page_scrolls_sideways(opened: Open) -> None:
             tab.wait_for_timeout(50)
         overflow[width] = tab.evaluate("document.documentElement.scrollWidth") - width
     assert overflow == dict.fromkeys(overflow, 0)
+
+
+def test_curves_drawn_at_first_have_the_first_colors_and_leave_room_on_a_phone(opened: Open) -> None:
+    """Of nine entries the first, the third and the ninth are drawn, whose places are those of two colors."""
+    speeds = [3 - i / 4 for i in range(9)]
+    quantum = [0, 0, 9, 0, 0, 0, 0, 0, 0]
+    members = [
+        boards.entry(f"entry {i}", speed=s, quantum=q) for i, (s, q) in enumerate(zip(speeds, quantum))
+    ]
+    sized = boards.changed(members[8], parameters={"classical": 396, "quantum": 0})
+    tab = opened(boards.of([*members[:8], sized]), 390)
+    assert picked(tab) == ["entry 0", "entry 2", "entry 8"]
+    tones = [line.get_attribute("class") for line in tab.locator("#board-0 .legend line").all()]
+    assert tones == ["c0 dash0", "c1 dash0", "c2 dash0"]
+    tab.locator("#board-0-table tbody tr").last.scroll_into_view_if_needed()
+    tops = [tab.locator(f"#board-0 .picked .{name}").bounding_box()["y"] for name in ("plot", "verdicts")]
+    assert tops[0] == 0, "the curves stay in sight"
+    assert tops[1] < -1000, "the words do not"
 
 
 def test_a_narrow_page_shows_cards_and_sorts_them(opened: Open, page: str) -> None:
