@@ -125,9 +125,9 @@ def describe(cls: type[Any]) -> list[dict[str, Any]]:
 def _values(schema: Mapping[str, Any]) -> str:
     """Say in a few words which values a JSON schema admits."""
     if "enum" in schema:
-        return " | ".join(map(_typed, schema["enum"]))
+        return " | ".join(map(typed, schema["enum"]))
     if "const" in schema:
-        return _typed(schema["const"])
+        return typed(schema["const"])
     if "anyOf" in schema:
         return " or ".join(_values(s) for s in schema["anyOf"])
     kind = str(schema.get("type", "value"))
@@ -144,7 +144,7 @@ def _values(schema: Mapping[str, Any]) -> str:
     return " ".join([kind, *bounds])
 
 
-def _typed(value: Any) -> str:
+def typed(value: Any) -> str:
     """Write a value in the form that `--set NAME=` reads."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -258,6 +258,19 @@ def tuned(cls: type[Any]) -> dict[str, Tuned]:
     """Return the marks of every option marked `Tuned`, by name."""
     fields_of = _pydantic_fields(cls)
     return {n: mark for n, info in fields_of.items() for mark in info.metadata if isinstance(mark, Tuned)}
+
+
+def listed_values(cls: type[Any]) -> dict[str, list[Any]]:
+    """Return, by name, the values of every option that lists them: of a `Literal`, or true and false."""
+    properties = pydantic.TypeAdapter(cls).json_schema().get("properties", {})
+    return {name: values for name, schema in properties.items() if (values := _listed(schema))}
+
+
+def _listed(schema: Mapping[str, Any]) -> list[Any]:
+    if schema.get("type") == "boolean":
+        return [True, False]
+    own = [schema["const"]] if "const" in schema else schema.get("enum", [])
+    return [*own, *(value for each in schema.get("anyOf", ()) for value in _listed(each))]
 
 
 def per_agent(cls: type[Any]) -> set[str]:

@@ -68,6 +68,7 @@ class QiskitBackend:
     def __init__(self, circuit: Circuit, options: QiskitOptions) -> None:
         self.options = options
         self.shots: int | None = options.shots
+        self.noisy = options.noise_model is not None or options.device is not None
         self.gradient = _gradient(options)
         self.draws = self.shots is not None or self.gradient == "spsa"
         self.table = AngleTable(circuit)

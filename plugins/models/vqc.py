@@ -296,6 +296,11 @@ class _Hybrid(nn.Module):
         return self._runner.circuit
 
     @property
+    def draws(self) -> bool:
+        """Whether outputs or gradients are random: of shots, of noise, or guessed."""
+        return self._runner.draws
+
+    @property
     def simulator(self) -> bool:
         """Whether the circuits are only simulated; else executions may cost money."""
         return bool(getattr(self._runner.backend, "simulator", True))

@@ -57,6 +57,8 @@ class CircuitBackend(Protocol):
 
     draws (bool):
         Whether results are random, so that `seeds` are needed; by default where `shots` is finite.
+    noisy (bool):
+        Whether values differ from the exact ones by noise; `qrlsuite check` then compares roughly. By default false.
     gradient_circuits (int):
         Circuits that it executes per input for a gradient; by default the number of the parameter-shift rule. They
         count if `draws` is true; for an exact simulator the rule's number counts, so that entries can be compared.
@@ -234,7 +236,7 @@ class _Whole:
         self.products = products
         first = parts[0]
         self.shots = first.shots
-        for name in ("draws", "simulator", "repeats", "terms"):
+        for name in ("draws", "noisy", "simulator", "repeats", "terms"):
             if hasattr(first, name):
                 setattr(self, name, getattr(first, name))
         if hasattr(first, "gradient_circuits"):

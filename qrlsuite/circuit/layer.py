@@ -101,14 +101,13 @@ class _OfAgents(torch.autograd.Function):
     def vmap(
         info: Any, axes: tuple[int | None, ...], layer: CircuitLayer, *tensors: Tensor
     ) -> tuple[Tensor, int]:
-        backend = layer._prepared()
-        if getattr(backend, "draws", backend.shots is not None):
+        if layer.draws:
             raise RuntimeError("vmap: samples are drawn for each agent in its turn")
         inputs, *parameters = (
             each.expand(info.batch_size, *each.shape) if axis is None else each.movedim(axis, 0)
             for axis, each in zip(axes[1:], tensors)
         )
-        return backend(inputs, dict(zip(layer.circuit, parameters)), None), 0
+        return layer._prepared()(inputs, dict(zip(layer.circuit, parameters)), None), 0
 
 
 class CircuitLayer(nn.Module):
@@ -190,12 +189,15 @@ class CircuitLayer(nn.Module):
             self._backend = create_backend(self.backend_name, self.description, **self.backend_options)
         return self._backend
 
+    @property
+    def draws(self) -> bool:
+        """Whether values or gradients are random: of shots, of noise, or guessed."""
+        backend = self._prepared()
+        return bool(getattr(backend, "draws", backend.shots is not None))
+
     def _sampling_seed(self) -> list[int] | None:
         """Return the seed of this pass's samples, None where values are exact."""
-        backend = self._prepared()
-        if not getattr(backend, "draws", backend.shots is not None):
-            return None
-        return [int(torch.randint(2**63 - 1, ()))]
+        return [int(torch.randint(2**63 - 1, ()))] if self.draws else None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy, which prepares its own backend at its first call."""

@@ -18,6 +18,8 @@ class CircuitModel(Protocol):
     The suite recognizes such a network by these attributes: it counts executions, prepares the circuit before the first
     epoch, evaluates the agents on other backends and diagnoses them. A network that has `executions` must
     have the others, too.
+
+    Where it says `draws`, outputs or gradients are random, and `qrlsuite check` compares none of two passes.
     """
 
     @property

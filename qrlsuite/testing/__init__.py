@@ -24,7 +24,7 @@ from qrlsuite.testing.findings import Finding
 
 __all__ = ["Finding", "assert_conforms", "check"]
 
-KINDS = ("ansatz", "circuit_backend", "model", "environment", "algorithm", "task")
+KINDS = ("ansatz", "circuit_backend", "model", "environment", "algorithm", "task", "tracker")
 """Kinds with rules of their own; of the others, loading and registering are checked."""
 
 Settings = Mapping[str, Any] | None

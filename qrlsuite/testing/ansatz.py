@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, cast
 
-import numpy as np
-
 from qrlsuite import registry, specs
-from qrlsuite.circuit import Circuit, create_backend, lightcone
+from qrlsuite.circuit import Circuit, CircuitBackend, create_backend, lightcone
 from qrlsuite.errors import CircuitError, OptionError
-from qrlsuite.testing import effects
-from qrlsuite.testing.common import Subject
-from qrlsuite.testing.dense import expectation_values
+from qrlsuite.testing import circuit_backend, effects
+from qrlsuite.testing.common import Subject, check_cases
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, one_thread, require
 
-QUBITS, LAYERS = (1, 2, 3, 4), (1, 2, 3)
+LAYERS, MOST = (1, 2, 3), 10
+"""Numbers of layers that are tried, and the largest smallest number of qubits."""
 LARGEST = 20
 
 Circuits = dict[tuple[int, int], Circuit]
@@ -22,16 +21,22 @@ Circuits = dict[tuple[int, int], Circuit]
 
 
 def check(subject: Subject) -> list[Finding]:
-    """Check an ansatz at 1 to 4 qubits, with 1 to 3 layers and with three per qubit."""
+    """Check an ansatz from the smallest number of qubits that it takes, with 1 to 3 layers and with three per qubit."""
     spec = subject.spec
     assert isinstance(spec, specs.AnsatzSpec)
     build, options = specs.resolve(spec.build), subject.options()
     circuits: Circuits = {}
     rules = Checklist()
-    several = {(qubits, layers) for qubits in QUBITS for layers in (*LAYERS, 3 * qubits)} | {(LARGEST, 1)}
-    sizes = {(spec.qubits, 1)} if spec.qubits else several
-    built = effects.size(spec.qubits, 1) if spec.qubits else "1 to 4 qubits, 1 to 12 layers"
-    if not rules.run("builds", built, lambda: _builds(build, options, circuits, sizes)):
+
+    def builds() -> str:
+        least = spec.qubits or _least(build, options)
+        several = {
+            (qubits, layers) for qubits in range(least, max(4, least) + 1) for layers in (*LAYERS, 3 * qubits)
+        }
+        circuits.update(_built(build, options, {(least, 1)} if spec.qubits else several | {(LARGEST, 1)}))
+        return " to ".join(effects.size(*size) for size in (min(circuits), max(circuits)))
+
+    if not rules.run("builds", "from its smallest size on", builds):
         return rules.findings
     rules.run("pure", "built twice, it is the same circuit", lambda: _pure(build, options, circuits))
     rules.run("inputs used", "every input feature sets an angle", lambda: _inputs(circuits))
@@ -51,44 +56,81 @@ def check(subject: Subject) -> list[Finding]:
                 "of every installed backend match finite differences",
                 lambda: _gradients(circuits),
             )
+        check_cases(rules, subject.choices(), lambda chosen: _works(build, chosen.options(), circuits))
     return rules.findings
 
 
-def _builds(build: Any, options: Any, circuits: Circuits, sizes: set[tuple[int, int]]) -> None:
-    refused = ""
-    for qubits, layers in sorted(sizes):
-        size = effects.size(qubits, layers)
-        try:
-            circuit = build(qubits, layers, options)
-        except CircuitError as error:
-            raise BrokenRuleError(
-                f"{size}: {error}; an ansatz that cannot have this size raises qrlsuite.errors.OptionError and says "
-                "which sizes it can have"
-            ) from error
-        except OptionError as error:  # an ansatz may refuse a size, in words
-            refused = str(error)
-            continue
-        except Exception as error:
-            raise BrokenRuleError(
-                f"{size}: {type(error).__name__}: {error}; an ansatz that cannot have this size raises "
-                "qrlsuite.errors.OptionError and says which sizes it can have"
-            ) from error
-        require(
-            isinstance(circuit, Circuit),
-            f"build returned {type(circuit).__name__}, not a qrlsuite.circuit.Circuit: is `return circuit` there?",
-        )
-        require(
-            circuit.qubits - circuit.deferred == qubits,
-            f"with qubits = {qubits} the circuit has {circuit.qubits - circuit.deferred}: write Circuit(qubits)",
-        )
-        require(bool(circuit.operations), f"{size}: the circuit has no gate; append some before `return`")
-        if qubits != LARGEST:
-            circuits[qubits, layers] = circuit
+def _works(build: Any, options: Any, usual: Circuits) -> None:
+    """Check the circuits with other options at the sizes with few layers."""
+    circuits = _built(build, options, {size for size in usual if size[1] in LAYERS})
     require(
-        any(layers in LAYERS for _, layers in circuits),
-        f"it refuses every size of 1 to 4 qubits and 1 to 3 layers: {refused}; models with few qubits are what "
-        "people try first",
+        any(_content(circuit) != _content(usual[size]) for size, circuit in circuits.items()),
+        "every circuit is the one of the default: is the option used?",
     )
+    if getattr(options, "entangled", None) == "mean-field":
+        require(
+            all(circuit.mean_field for circuit in circuits.values()),
+            "the circuit is entangled: write Circuit(qubits, mean_field=options.entangled == 'mean-field')",
+        )
+    _pure(build, options, circuits)
+    _inputs(circuits)
+    _parameters(circuits)
+    _effects(circuits, grows=False)
+    _backends(circuits)
+
+
+def _least(build: Any, options: Any) -> int:
+    """Return the smallest number of qubits that the ansatz does not refuse."""
+    for qubits in range(1, MOST + 1):
+        try:
+            _built(build, options, {(qubits, layers) for layers in LAYERS})
+        except OptionError as error:
+            refused = error
+        else:
+            return qubits
+    raise BrokenRuleError(
+        f"it refuses every size of 1 to {MOST} qubits and 1 to 3 layers: {refused}; models with few qubits are what "
+        "people try first"
+    )
+
+
+def _built(build: Any, options: Any, sizes: set[tuple[int, int]]) -> Circuits:
+    """Return the circuits of the sizes that the ansatz takes; it must take one with few layers."""
+    circuits: Circuits = {}
+    for size in sorted(sizes):
+        try:
+            circuits[size] = _made(build, *size, options)
+        except OptionError as error:
+            refused = error
+    circuits.pop((LARGEST, 1), None)
+    if not any(layers in LAYERS for _, layers in circuits):
+        raise refused
+    return circuits
+
+
+def _made(build: Any, qubits: int, layers: int, options: Any) -> Circuit:
+    """Return the circuit of a size; raises `OptionError` where the ansatz refuses it in words."""
+    size = effects.size(qubits, layers)
+    try:
+        circuit = build(qubits, layers, options)
+    except Exception as error:
+        if isinstance(error, OptionError) and not isinstance(error, CircuitError):
+            raise
+        name = "" if isinstance(error, CircuitError) else f"{type(error).__name__}: "
+        raise BrokenRuleError(
+            f"{size}: {name}{error}; an ansatz that cannot have this size raises qrlsuite.errors.OptionError and "
+            "says which sizes it can have"
+        ) from error
+    require(
+        isinstance(circuit, Circuit),
+        f"build returned {type(circuit).__name__}, not a qrlsuite.circuit.Circuit: is `return circuit` there?",
+    )
+    require(
+        circuit.qubits - circuit.deferred == qubits,
+        f"with qubits = {qubits} the circuit has {circuit.qubits - circuit.deferred}: write Circuit(qubits)",
+    )
+    require(bool(circuit.operations), f"{size}: the circuit has no gate; append some before `return`")
+    return cast(Circuit, circuit)
 
 
 def _pure(build: Any, options: Any, circuits: Circuits) -> None:
@@ -102,7 +144,8 @@ def _pure(build: Any, options: Any, circuits: Circuits) -> None:
 
 
 def _content(circuit: Circuit) -> tuple[Any, ...]:
-    return circuit.inputs, circuit.operations, tuple(circuit.parameters.values()), circuit.observables
+    parameters = tuple(circuit.parameters.values())
+    return circuit.inputs, circuit.operations, parameters, circuit.observables, circuit.mean_field
 
 
 def _inputs(circuits: Circuits) -> None:
@@ -165,70 +208,47 @@ def _smallest(circuits: Circuits) -> Circuit:
     return circuits[min(circuits, key=lambda size: (abs(size[0] - 2), abs(size[1] - 2)))]
 
 
-def _able(circuit: Circuit) -> list[str]:
-    """Return the installed backends that compute this kind of circuit."""
-    names = registry.load().names(specs.CircuitBackendSpec)
-    return [
-        name
-        for name in names
-        if registry.get(specs.CircuitBackendSpec, name).mean_field or not circuit.mean_field
-    ]
+def _runs(circuit: Circuit) -> Iterator[tuple[str, CircuitBackend]]:
+    """Yield the installed backends that compute a circuit exactly, by name."""
+    for name, each in registry.load().of(specs.CircuitBackendSpec).items():
+        if circuit.mean_field and not each.spec.mean_field:
+            continue
+        try:
+            run = create_backend(name, circuit)
+        except Exception as error:
+            raise BrokenRuleError(_cannot(name, error)) from error
+        if circuit_backend.exact(run):
+            yield name, run
 
 
-def _run(backend: str, circuit: Circuit, x: Any, parameters: dict[str, Any]) -> Any:
-    """Return a backend's values (1, 2, out), or None where it samples."""
-    try:
-        run = create_backend(backend, circuit)
-        values = run(x, parameters)
-    except Exception as error:
-        raise BrokenRuleError(
-            f"backend '{backend}' cannot run it: {type(error).__name__}: {error}; write a gate that it lacks as others "
-            f"that it has, and see whether `qrlsuite check circuit-backend:{backend}` passes"
-        ) from error
-    return None if run.shots is not None else values
-
-
-def _dense(circuit: Circuit, x: Any, parameters: dict[str, Any]) -> Any:
-    """Return the expectation values (1, 2, out) by dense matrices."""
-    mine = {name: value[0].detach().numpy() for name, value in parameters.items()}
-    return np.array([[expectation_values(circuit, row, mine) for row in x[0].detach().numpy()]])
+def _cannot(backend: str, error: Exception) -> str:
+    return (
+        f"backend '{backend}' cannot run it: {type(error).__name__}: {error}; write a gate that it lacks as others "
+        f"that it has, and see whether `qrlsuite check circuit-backend:{backend}` passes"
+    )
 
 
 def _backends(circuits: Circuits) -> None:
     circuit = _smallest(circuits)
-    x, parameters, _ = effects.sample(circuit)
-    expected = _dense(circuit, x, parameters)
-    for backend in _able(circuit):
-        values = _run(backend, circuit, x, parameters)
-        difference = 0.0 if values is None else float(np.abs(values.detach().numpy() - expected).max())
+    for backend, run in _runs(circuit):
+        try:
+            difference = circuit_backend.distance(run, circuit, 1)
+        except Exception as error:
+            raise BrokenRuleError(_cannot(backend, error)) from error
         require(
             difference < 1e-6,
-            f"the values of backend '{backend}' differ by {difference:.2g} from dense matrices; the fault is the "
-            f"backend's: see `qrlsuite check circuit-backend:{backend}`, and report it",
+            f"the values of backend '{backend}' differ by {difference:.2g} from dense matrices; {_fault(backend)}",
         )
 
 
 def _gradients(circuits: Circuits) -> None:
     circuit = _smallest(circuits)
-    for backend in _able(circuit):
-        x, parameters, cotangent = effects.sample(circuit)
-        values = _run(backend, circuit, x, parameters)
-        if values is None:
-            continue
-        values.backward(cotangent)
-        for name, leaf in {"inputs": x, **parameters}.items():
-            direction = np.random.default_rng(1).standard_normal(tuple(leaf.shape))
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = leaf.detach() + sign * 1e-5 * leaf.new_tensor(direction)
-                others = {k: moved if k == name else v for k, v in parameters.items()}
-                shifted = _dense(circuit, moved if name == "inputs" else x, others)
-                sides.append(float((shifted * cotangent.numpy()).sum()))
-            numeric = (sides[0] - sides[1]) / 2e-5
-            exact = 0.0 if leaf.grad is None else float((leaf.grad.numpy() * direction).sum())
-            require(
-                abs(numeric - exact) <= 1e-6 * max(1.0, abs(exact)),
-                f"backend '{backend}' gives the derivative by {name} as {exact:.6g}, finite differences of dense "
-                f"matrices give {numeric:.6g}; the fault is the backend's: see `qrlsuite check "
-                f"circuit-backend:{backend}`, and report it",
-            )
+    for backend, run in _runs(circuit):
+        try:
+            circuit_backend.require_gradients(run, circuit)
+        except BrokenRuleError as error:
+            raise BrokenRuleError(f"backend '{backend}': {error}; {_fault(backend)}") from error
+
+
+def _fault(backend: str) -> str:
+    return f"the fault is the backend's: see `qrlsuite check circuit-backend:{backend}`, and report it"

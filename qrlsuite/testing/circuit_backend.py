@@ -14,11 +14,13 @@ from torch import Tensor
 from qrlsuite import specs
 from qrlsuite.circuit import GATES, Circuit
 from qrlsuite.testing.circuits import every_gate, one_gate, small
-from qrlsuite.testing.common import Subject
+from qrlsuite.testing.common import Subject, check_cases
 from qrlsuite.testing.dense import expectation_values
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
 
 S, B, SHOTS = 5, 2, 200
+NOISE = 0.3
+"""Distance of a noisy backend's values from the exact ones, at most."""
 
 SEEDS = (1, 2**31 + 1, 2**40 + 7, 2**62 + 1, 2**63 - 1)
 """One per agent: runs draw them from all of 0 to 2^63 - 1."""
@@ -45,37 +47,65 @@ def check(subject: Subject) -> list[Finding]:
         shapes = "(S, B, observables) in float32 and float64, for one agent, input or observable too"
         if not rules.run("shapes", shapes, lambda: _shapes(factory, run, circuit, options), cause):
             return rules.findings
-        if run.shots is None:
+        if noisy(run):
+            rules.run(
+                "values",
+                "near the exact ones; it says that it is noisy, so nothing exact is tried",
+                lambda: _near(factory(small(), options)),
+            )
+        elif run.shots is None:
             rules.run("values", "equal to dense matrices within 1e-6", lambda: _values(factory, options))
-            rules.run("gradients", "equal to finite differences", lambda: _gradients(run, circuit))
+            rules.run("gradients", "equal to finite differences", lambda: require_gradients(run, circuit))
             rules.run("repeatable", "called twice, the same bits", lambda: _repeatable(run, circuit))
             rules.run(
                 "seed independence",
                 "alone, in pairs, shuffled: the same bits in values and gradients",
                 lambda: _independence(run, circuit, None),
             )
-        if spec.mean_field:
+        if spec.mean_field and exact(run):
             rules.run(
                 "mean field",
                 "values, gradients and seeds of mean-field circuits too",
                 lambda: _mean_field(factory, options),
             )
-        if run.shots is not None or "shots" in specs.resolve(spec.options).__dataclass_fields__:
+        samples = run.shots is not None or "shots" in specs.resolve(spec.options).__dataclass_fields__
+        if samples and not noisy(run):
             rules.run(
                 "shots",
                 "near the exact values, and the sampling of a seed depends on that seed alone",
                 lambda: _shots(subject, factory, run.shots),
                 cause,
             )
+        check_cases(rules, subject.choices(), lambda chosen: _works(factory, chosen.options()))
     return rules.findings
+
+
+def noisy(run: Any) -> bool:
+    """Return whether a backend says that its values differ from the exact ones by noise."""
+    return bool(getattr(run, "noisy", False))
+
+
+def exact(run: Any) -> bool:
+    """Return whether a backend says that its values are exact."""
+    return run.shots is None and not noisy(run)
+
+
+def _works(factory: Any, options: Any) -> None:
+    """Check values and shapes of gradients with options; exact values where the backend says so."""
+    circuit = small()
+    run = _build(factory, circuit, options)
+    evaluate(run, *sample(circuit), SEEDS)
+    if exact(run):
+        difference = distance(run, circuit)
+        require(difference < 1e-6, f"values differ from dense matrices by {difference:.2g}")
 
 
 def sample(
     circuit: Circuit, seeds: int = S, batch: int = B, dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-    """Return inputs (S, B, in), parameters (S, ...) and a cotangent (S, B, out)."""
+    """Return inputs (S, B, in) in [-1, 1], parameters (S, ...) and a cotangent (S, B, out)."""
     source = torch.Generator().manual_seed(0)
-    x = torch.randn(seeds, batch, circuit.inputs, generator=source, dtype=torch.float64)
+    x = 2 * torch.rand(seeds, batch, circuit.inputs, generator=source, dtype=torch.float64) - 1
     weights = {
         name: (2 * math.pi * torch.rand(seeds, *p.shape, generator=source, dtype=torch.float64)).to(dtype)
         for name, p in circuit.parameters.items()
@@ -176,17 +206,33 @@ def _dense(circuit: Circuit, x: Tensor, weights: dict[str, Tensor]) -> Tensor:
     return torch.from_numpy(np.array(rows))
 
 
-def _distance(factory: Any, circuit: Circuit, options: Any, reverse: bool = False) -> float:
+def distance(run: Any, circuit: Circuit, seeds: int = S, reverse: bool = False) -> float:
     """Return the largest distance of a backend's values from dense matrices' values."""
-    x, weights, _ = sample(circuit, batch=3)
+    x, weights, _ = sample(circuit, seeds, batch=3)
     expected = _dense(circuit, x, weights)
-    got = factory(circuit, options)(x, weights).detach()
+    got = run(x, weights).detach()
     return float((got - (expected.flip(2) if reverse else expected)).abs().max())
+
+
+def _error(run: Any, circuit: Circuit) -> float:
+    """Return the root mean square of the distances of a backend's values from dense matrices' values."""
+    x, weights, _ = sample(circuit)
+    return float((run(x, weights, SEEDS).detach() - _dense(circuit, x, weights)).square().mean().sqrt())
+
+
+def _near(run: Any) -> None:
+    """Require that noise leaves most of the values."""
+    error = _error(run, small())
+    require(
+        error < NOISE,
+        f"it says that it is noisy, and values are {error:.2g} from the exact ones (root mean square): is more wrong?",
+    )
 
 
 def _values(factory: Any, options: Any) -> None:
     for circuit in (small(), every_gate()):
-        difference = _distance(factory, circuit, options)
+        run = factory(circuit, options)
+        difference = distance(run, circuit)
         if difference < 1e-6:
             continue
         cause = (
@@ -194,7 +240,7 @@ def _values(factory: Any, options: Any) -> None:
             "angles, and at scale * input + weight"
         )
         wrong = _wrong_gates(factory, options)
-        if _distance(factory, circuit, options, reverse=True) < 1e-6:
+        if distance(run, circuit, reverse=True) < 1e-6:
             cause = "they agree in reverse: results come in the order of circuit.observables"
         elif wrong:
             cause = (
@@ -208,14 +254,14 @@ def _values(factory: Any, options: Any) -> None:
 
 def _mean_field(factory: Any, options: Any) -> None:
     circuit = every_gate(mean_field=True)
-    difference = _distance(factory, circuit, options)
+    run = factory(circuit, options)
+    difference = distance(run, circuit)
     require(
         difference < 1e-6,
         f"the spec says mean_field=True, and values of a mean-field circuit differ from density matrices by "
         f"{difference:.2g}: after every gate on two qubits only the reduced state of each may be kept",
     )
-    run = factory(circuit, options)
-    _gradients(run, circuit)
+    require_gradients(run, circuit)
     _independence(run, circuit, None)
 
 
@@ -227,11 +273,12 @@ def _wrong_gates(factory: Any, options: Any) -> list[str]:
     return [
         f"{gate} with control" if controlled else gate
         for gate, controlled in tried
-        if not _distance(factory, one_gate(gate, controlled), options) < 1e-6
+        if not distance(factory(circuit := one_gate(gate, controlled), options), circuit) < 1e-6
     ]
 
 
-def _gradients(run: Any, circuit: Circuit) -> None:
+def require_gradients(run: Any, circuit: Circuit) -> None:
+    """Require that gradients are finite differences of the values."""
     x, weights, cotangent = sample(circuit, seeds=1)
     got = evaluate(run, x, weights, cotangent)
     for name, leaf in {"inputs": x, **weights}.items():
@@ -249,7 +296,7 @@ def _gradients(run: Any, circuit: Circuit) -> None:
             "rule of controlled rotations has four terms, a factor of scaled inputs belongs to the chain rule, and an "
             "element that sets several angles gets the sum",
         )
-    fixed = evaluate(run, x, weights, cotangent, fixed_inputs=True)
+    fixed = evaluate(run, x, weights, cotangent, fixed_inputs=True) if weights else {}
     for name, value in fixed.items():
         require(
             torch.allclose(value, got[name], rtol=1e-6, atol=1e-6),
@@ -310,7 +357,7 @@ def _shots(subject: Subject, factory: Any, shots: int | None) -> None:
         not torch.equal(first_fresh, second_fresh),
         "without seeds two calls give the same samples: None stands for fresh entropy",
     )
-    error = float((first - _dense(circuit, x, weights)).square().mean().sqrt())
+    error = _error(run, circuit)
     require(
         error <= 2 / math.sqrt(n_shots),
         f"with {n_shots} shots values are {error:.2g} from the exact ones (root mean square), and sampling allows "

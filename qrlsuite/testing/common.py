@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib.util
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from qrlsuite import options as option_values
 from qrlsuite import registry, specs
@@ -69,6 +70,19 @@ class Subject:
             )
             pairs[name] = low, high
         return pairs
+
+    def choices(self) -> dict[str, Subject]:
+        """Return, for every other value of the options that list their values, the subject with it, by `NAME=VALUE`."""
+        options = self.options()
+        return {
+            f"{name}={option_values.typed(value)}": dataclasses.replace(
+                self, settings={**self.settings, name: value}
+            )
+            for name, values in option_values.listed_values(type(options)).items()
+            if name not in self.settings
+            for value in values
+            if value != getattr(options, name)
+        }
 
     def counting(self, number: int) -> dict[str, Any]:
         """Return, for every option with a whole number that is not among the settings, options where it is another."""
@@ -151,6 +165,26 @@ def check_common(subject: Subject) -> tuple[list[Finding], bool]:
             "options", "defaults are valid, frozen, and survive being stored", lambda: _options(subject)
         )
     return rules.findings, usable
+
+
+Case = TypeVar("Case")
+
+
+def check_cases(rules: Checklist, cases: Mapping[str, Case], check: Callable[[Case], object]) -> None:
+    """Run a short check on each case, by its name; it holds, or the case is refused in words.
+
+    Nothing is tried where a rule is broken: the cases would break it, too.
+    """
+
+    def once(case: Case) -> str | None:
+        try:
+            check(case)
+        except OptionError as error:
+            return f"refused: {error}"
+        return None
+
+    for name, case in cases.items() if all(each.ok for each in rules.findings) else ():
+        rules.run(name, "tried by itself", functools.partial(once, case))
 
 
 def _name(subject: Subject) -> None:

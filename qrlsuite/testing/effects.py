@@ -15,11 +15,11 @@ Effects are found by gradients at random points, and their likely cause by the c
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend, lightcone
+from qrlsuite.testing.circuit_backend import sample
 from qrlsuite.testing.findings import BrokenRuleError, require
 
 POINTS = 4
@@ -44,20 +44,6 @@ _BOTH = (
     "it and after it"
 )
 _CANCELS = "it cancels within the circuit, as RZ(w), X, RZ(w) does; leave it out"
-
-
-def sample(circuit: Circuit, seeds: int = 1) -> tuple[Any, dict[str, Any], Any]:
-    """Return inputs (seeds, 2, in) and parameters (seeds, ...), leaves of float64, and a cotangent (seeds, 2, out)."""
-    import torch
-
-    source = torch.Generator().manual_seed(0)
-    x = torch.rand(seeds, 2, circuit.inputs, generator=source, dtype=torch.float64) * 2 - 1
-    weights = {
-        name: 2 * math.pi * torch.rand(seeds, *p.shape, generator=source, dtype=torch.float64)
-        for name, p in circuit.parameters.items()
-    }
-    cotangent = torch.rand(seeds, 2, len(circuit.observables), generator=source, dtype=torch.float64) + 0.5
-    return x.requires_grad_(), {name: w.requires_grad_() for name, w in weights.items()}, cotangent
 
 
 def size(qubits: int, layers: int) -> str:
@@ -87,6 +73,8 @@ def effective(circuit: Circuit) -> tuple[set[int], set[Scalar]]:
         bool(names), "no circuit backend is installed: install qrlsuite again, some are among its plugins"
     )
     x, parameters, cotangent = sample(circuit, POINTS)
+    for leaf in (x, *parameters.values()):
+        leaf.requires_grad_()
     values = create_backend("native" if "native" in names else names[0], circuit)(x, parameters)
     if values.requires_grad:
         values.backward(cotangent)  # type: ignore[no-untyped-call]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-from qrlsuite.errors import PluginError
+from qrlsuite.errors import QrlSuiteError
 
 SIZES: tuple[tuple[int, ...], ...] = ((0,), (3,), (1, 2), (4, 1, 3), (3, 0, 4, 2, 1))
 """Groups in which an agent of 0..4 is compared with itself among all five: alone, in pairs, shuffled."""
@@ -77,15 +77,15 @@ class Checklist:
         looked_at:
             What a passing check has established.
         check:
-            Raises `BrokenRuleError` or `PluginError` where the rule is broken. Any other exception breaks it too. A
-            returned text is what else it has established.
+            Raises `BrokenRuleError` or an error of the suite where the rule is broken. Any other exception breaks it
+            too. A returned text is what else it has established.
         cause:
             The likely cause of another exception.
         """
         _watcher.get()(rule)
         try:
             more = check()
-        except (BrokenRuleError, PluginError) as error:
+        except (BrokenRuleError, QrlSuiteError) as error:  # these say the place and the remedy
             self.findings.append(Finding(rule, False, str(error)))
         except Exception as error:  # whatever a stranger's code raises is the stranger's to read
             hint = f"; {cause}" if cause else ""

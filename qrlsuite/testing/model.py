@@ -10,13 +10,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Discrete, Space
 from gymnasium.spaces.utils import flatten_space
 from torch import Tensor, nn
 
 from qrlsuite import population as populations
 from qrlsuite import specs
-from qrlsuite.testing.common import Subject
+from qrlsuite.errors import OptionError
+from qrlsuite.testing.common import Subject, check_cases
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
 from qrlsuite.testing.group import World
 from qrlsuite.training import questions, unregistered
@@ -24,8 +25,14 @@ from qrlsuite.training.fences import seeded
 from qrlsuite.training.trainer import build_agent, observed_space
 
 OUT, B, S = 3, 6, 5
-FLAT, IMAGE = Box(-1.0, 1.0, (4,)), Box(0.0, 1.0, (10, 9, 2))
-"""Observation spaces here: flat, and an image for models that ask for the space."""
+FLAT = Box(-1.0, 1.0, (4,))
+SPACES: dict[str, Space[Any]] = {
+    "an image": Box(0.0, 1.0, (10, 9, 2)),
+    "an image, channels first": Box(0.0, 1.0, (2, 10, 9)),
+    "a Dict": Dict({"place": Box(-1.0, 1.0, (3,)), "kind": Discrete(4)}),
+    "numbers": FLAT,
+}
+"""Observations for models that ask for their space; others get numbers."""
 ODD = 5
 """A number of units (or other counts in options) that no vector of the processor divides."""
 BATCHES = (B, 1, 3, 7, 13)
@@ -34,19 +41,23 @@ BATCHES = (B, 1, 3, 7, 13)
 class Subjects:
     """Builds agents and populations of the model that is checked."""
 
-    def __init__(self, subject: Subject, task: str | None) -> None:
+    def __init__(self, subject: Subject, space: Space[Any]) -> None:
         spec = subject.spec
         assert isinstance(spec, specs.ModelSpec)
         self.spec, self.options, self.per_agent = spec, subject.options(), subject.per_agent()
-        self.build = specs.resolve(spec.build)
-        asks = "space" in inspect.signature(self.build).parameters
-        self.space: Any = IMAGE if asks else FLAT
-        if task is not None:
-            self.space = observed_space(World.of_task(task).one)
+        self.build, self.space = specs.resolve(spec.build), space
         self.inputs = math.prod(flatten_space(self.space).shape or ())
-        self.sampled = getattr(self.options, "shots", None) is not None
-        self.odd = {name: own for name, own in subject.counting(ODD).items() if self._builds(own)}
+        self._counting = subject.counting(ODD)
+
+    @functools.cached_property
+    def odd(self) -> dict[str, Any]:
         """Options by the name of one that is an odd number, where the model can be built with it."""
+        return {name: own for name, own in self._counting.items() if self._builds(own)}
+
+    @functools.cached_property
+    def sampled(self) -> bool:
+        """Whether outputs or gradients are random, as of a circuit with shots or noise."""
+        return any(getattr(part, "draws", False) for part in self._raw(0).modules())
 
     def _builds(self, options: Any) -> bool:
         try:
@@ -102,7 +113,7 @@ class Subjects:
 
 
 def check(subject: Subject, task: str | None = None) -> list[Finding]:
-    """Check a model with 4 inputs and 3 outputs, or with an image where it asks for the observations' space.
+    """Check a model with 4 inputs and 3 outputs; one that asks for the observations' space, with all that it takes.
 
     Parameters
     ----------
@@ -111,8 +122,8 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
     """
     if subject.spec.name == specs.NO_MODEL:  # there is nothing to build
         return []
-    subjects = Subjects(subject, task)
-    rules = Checklist()
+    spaces = _spaces(subject, task)
+    subjects, rules = Subjects(subject, next(iter(spaces.values()))), Checklist()
     with one_thread():
         if not rules.run(
             "builds", "a torch.nn.Module from (4, 3, options, generator)", lambda: _builds(subjects)
@@ -158,7 +169,34 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
             cause,
         )
         rules.run("state", "saved, sliced and restored exactly", lambda: _state(subjects))
+        further = dict(list(spaces.items())[1:])
+        check_cases(rules, further, lambda space: _works(Subjects(subject, space)))
+        check_cases(rules, subject.choices(), lambda chosen: _works(Subjects(chosen, subjects.space)))
     return rules.findings
+
+
+def _spaces(subject: Subject, task: str | None) -> dict[str, Space[Any]]:
+    """Return the observations to check with: a task's, numbers, or those that the model does not refuse in words."""
+    assert isinstance(subject.spec, specs.ModelSpec)
+    if task is not None:
+        return {task: observed_space(World.of_task(task).one)}
+    if "space" not in inspect.signature(specs.resolve(subject.spec.build)).parameters:
+        return {"numbers": FLAT}
+    taken = dict(SPACES)
+    for name, space in SPACES.items():
+        try:
+            Subjects(subject, space).agent(0)
+        except OptionError:
+            del taken[name]
+        except Exception:  # is named where it is built again
+            pass
+    return taken or SPACES
+
+
+def _works(subjects: Subjects) -> None:
+    """Check an agent and a population in a pass."""
+    for rule in (_builds, _shapes, _registered, _flow, _population):
+        rule(subjects)
 
 
 def _builds(subjects: Subjects) -> None:

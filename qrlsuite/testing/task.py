@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +45,6 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-@contextlib.contextmanager
-def _in_its_words() -> Iterator[None]:
-    """Turn the suite's own errors into broken rules: they name the place and the remedy."""
-    try:
-        yield
-    except QrlSuiteError as error:
-        raise BrokenRuleError(str(error)) from error
-
-
 def _path(path: str) -> None:
     """Require that the spec leads to a file, from whatever folder a command runs in."""
     require(
@@ -73,8 +63,7 @@ def _parsed(spec: specs.TaskSpec) -> Task:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise BrokenRuleError(f"{path.name} is not text in UTF-8, as TOML is: {error}") from error
-    with _in_its_words():
-        return parse(text, path.name)
+    return parse(text, path.name)
 
 
 def _names(spec: specs.TaskSpec, task: Task) -> None:
@@ -155,18 +144,17 @@ def _scores(task: Task) -> None:
     model = next(iter(registered.of(specs.ModelSpec).values())).spec
     choose = np.random.Generator(np.random.Philox(key=9))
     ended = 0
-    with _in_its_words():
-        envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
-        envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
-        envs.reset()
-        for _ in range(LONGEST):
-            envs.step(draw(envs.single_action_space, choose, 2))
-            _, returns, scores = envs.take_finished()
-            for value, score in zip(returns, scores):
-                _score(task, float(value), float(score))
-            ended += scores.size
-            if ended >= EPISODES:
-                return
+    envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
+    envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
+    envs.reset()
+    for _ in range(LONGEST):
+        envs.step(draw(envs.single_action_space, choose, 2))
+        _, returns, scores = envs.take_finished()
+        for value, score in zip(returns, scores):
+            _score(task, float(value), float(score))
+        ended += scores.size
+        if ended >= EPISODES:
+            return
     require(
         ended > 0, f"no episode ended within {LONGEST} steps of random actions: the task needs a time limit"
     )

@@ -19,10 +19,10 @@ from typer.testing import CliRunner
 from qrlsuite import hookspecs, registry, specs
 from qrlsuite.cli.extensions import add_commands
 from qrlsuite.columns import Column
+from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.commands import qrlsuite
 from tests.conftest import install, installed
-from tests.trackers import RECORD, RUN
 
 MANUAL = (Path(__file__).parents[2] / "docs" / "api" / "hooks.md").read_text()
 EXAMPLES = dict(re.findall(r"^## `(\w+)`\n.*?```python\n(.*?)```", MANUAL, re.MULTILINE | re.DOTALL))

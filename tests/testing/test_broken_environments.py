@@ -154,6 +154,11 @@ EDITS = [
          ": self.resets", ": np.array([None] * self.num_envs)"),
     edit("state", r"has no attribute 'ready'; .* in new lanes that were never reset",
          "self.resets += 1", "self.resets += 1; self.ready = True", "state.items()", "self.ready and state.items()"),
+    edit("kind=wide", r"observations are float64", "import Annotated", "import Annotated, Literal", "class Options:",
+         "class Options:\n    kind: Literal['plain', 'wide'] = 'plain'", "steps=40):", "steps=40, kind='plain'):",
+         "self.steps, self.streams = options.steps, []",
+         "self.steps, self.streams, self.kind = options.steps, [], options.kind",
+         SEEN, f"{SEEN}.astype(np.float64 if self.kind == 'wide' else np.float32)"),
     edit("validation", r"IndexError: .*in validation a stream serves several lanes, lane l by",
          "lane // per_stream", "lane"),
     edit("validation", r"seeds \[3\] among themselves see other observations .* lane l draws",
@@ -190,7 +195,7 @@ def test_one_rule_is_broken(edit: Edit) -> None:
 
 @pytest.mark.parametrize("vector", ["Lanes", None])
 def test_every_rule_has_an_environment_that_breaks_it(vector: str | None) -> None:
-    assert assert_all_good(spec(vector=vector)) == {edit.rule for edit in EDITS}
+    assert assert_all_good(spec(vector=vector)) == {edit.rule for edit in EDITS if "=" not in edit.rule}
 
 
 def test_episodes_may_be_alike_where_they_are_meant_to() -> None:

@@ -16,9 +16,9 @@ import pytest
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.plugins.trackers import common
 from qrlsuite.results.store import EntryStore
+from qrlsuite.testing.tracker import RECORD, RUN
 from tests.commands import start_worker
 from tests.conftest import Hold, Train, most_epochs
-from tests.trackers import RECORD, RUN
 from tests.trackers.test_tensorboard import read as read_tensorboard
 
 Curves = dict[str, list[tuple[int, float]]]

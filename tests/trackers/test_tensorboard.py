@@ -11,9 +11,10 @@ import pytest
 from qrlsuite import registry, specs
 from qrlsuite.errors import QrlSuiteError, UnknownNameError
 from qrlsuite.plugins.trackers.tensorboard import TensorBoard
+from qrlsuite.testing import check
+from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.conftest import Train
-from tests.trackers import RECORD, RUN
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -113,3 +114,25 @@ def test_asking_for_what_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
         QrlSuiteError, match="tracker 'far' needs the package 'no_such_module': pip install far"
     ):
         trackers.parse(["far"])
+
+
+class Changes:
+    """Breaks a rule of trackers."""
+
+    def __init__(self, target: str | None) -> None:
+        if target == "target":
+            raise ValueError("no such place")
+
+    def epoch_finished(self, run: dict[str, Any], record: dict[str, Any]) -> None:
+        record["loss"] = record["scores"].pop() if record["train_return"] is None else 0.0
+
+
+def test_check_tells_a_tracker_the_events_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    findings = check("tracker", specs.TrackerSpec("changes", "Changes", f"{__name__}:Changes"))
+    broken = {finding.rule: finding.message for finding in findings if not finding.ok}
+    assert broken.keys() == {"events", "target"}
+    assert "epoch_finished changes what it is given: copy it" in broken["events"]
+    assert "ValueError: no such place; the factory takes 'target'" in broken["target"]
+    assert all(finding.ok for finding in check("tracker", "tensorboard"))
+    assert not list(tmp_path.iterdir())

@@ -56,9 +56,8 @@ class NativeBackend:
         self.options = NativeOptions() if options is None else options
         _check(self.options, circuit)
         self.shots = self.options.shots
-        self.draws = (
-            self.shots is not None or self.options.noise_model is not None or self.options.gradient == "spsa"
-        )
+        self.noisy = self.options.noise_model is not None
+        self.draws = self.shots is not None or self.noisy or self.options.gradient == "spsa"
         self.circuit = copy.deepcopy(circuit)
         self.shapes = {name: p.shape for name, p in circuit.parameters.items()}
         self._simulator: Simulator | None = None
