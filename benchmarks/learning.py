@@ -1,6 +1,6 @@
-"""Learning on CartPole at equal settings, side by side with Stable-Baselines3, CleanRL's SAC, JAX and plain torch.
+"""Learning on CartPole at equal settings, side by side with Stable-Baselines3, SBX, rejax, CleanRL, JAX and plain torch.
 
-    pip install 'qrlsuite[bench]'
+    pip install '.[bench]'
     python benchmarks/learning.py [--algorithms ddqn ppo sac] [--seeds 10] [--epochs 100] [--json out.json]
 
 Every agent has the same network, learning rate, discount, batch, replay buffer, target updates, exploration and
@@ -11,8 +11,9 @@ is switched to what the suite does: no clipping of gradients, constant explorati
 initialization, Adam's eps 1e-8. Two differences remain in its DQN and cannot be switched: targets are not double, and
 the error is Huber's; with several environments it also flips one coin for all of them where the suite flips one each.
 The third row, `SB3 DQN, our update`, is the same class with these three replaced, as the suite has them.
-`JAX, jit and vmap` is the same loop in `jax_ddqn.py`, with every seed and the environment in one compiled epoch; its
-compilation is not counted. `torch, one seed` is the loop in the manner of CleanRL's single files.
+`JAX, jit and vmap` is the same loop in `jax_ddqn.py`, with every seed and the environment in one compiled epoch, as in
+rejax's PPO, which clips the loss of its values and has flax's initialization. SBX is SB3 in JAX, one seed at a time.
+Compilation is not counted. `torch, one seed` is the loop in the manner of CleanRL's single files.
 
 Discrete SAC (Christodoulou 2019) is held to the equations of CleanRL's `sac_atari.py` (commit 004f8a0), written out
 here for CartPole's network: the loss of its temperature is linear in alpha and not in log alpha, means of the actor's
@@ -112,11 +113,14 @@ def theirs(name: str, make: Callable[[Any, int], Any], entry: Entry, seeds: rang
     """Train a peer's agents one by one; `make` builds one from its environments and a seed."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 
+    def begin(seed: int) -> Any:
+        return make(DummyVecEnv([lambda: gymnasium.make("CartPole-v1")] * ENVIRONMENTS), seed)
+
+    begin(0).learn(INTERACTIONS, reset_num_timesteps=False)  # what is compiled, is compiled here
     seconds, curves = 0.0, []
     for seed in seeds:
         play = Evaluation(entry, [Streams(entry.task.hash, seed)])
-        environments = DummyVecEnv([lambda: gymnasium.make("CartPole-v1")] * ENVIRONMENTS)
-        agent = make(environments, seed)
+        agent = begin(seed)
 
         def act(observations: NDArray[np.float32], agent: Any = agent) -> NDArray[np.int64]:
             actions, _ = agent.predict(observations[0], deterministic=True)
@@ -261,7 +265,6 @@ class PlainDDQN:
 def by_jax(entry: Entry, seeds: range, epochs: int) -> Runs:
     """Train JAX's agents together, see `jax_ddqn`; compilation is not counted."""
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    import jax
     import jax_ddqn
 
     assert jax_ddqn.check() < 1e-5, "JAX's CartPole is another one"
@@ -279,6 +282,14 @@ def by_jax(entry: Entry, seeds: range, epochs: int) -> Runs:
         rounds=INTERACTIONS // ENVIRONMENTS,
     )
     begin, epoch, act = jax_ddqn.compiled(settings)
+    return _together("JAX, jit and vmap", entry, seeds, epochs, (begin, epoch, act))
+
+
+def _together(name: str, entry: Entry, seeds: range, epochs: int, functions: tuple[Any, Any, Any]) -> Runs:
+    """Train agents that begin, learn an epoch and act by compiled functions; compilation is not counted."""
+    import jax
+
+    begin, epoch, act = functions
     keys = jax.vmap(jax.random.key)(np.array(seeds))
     jax.block_until_ready(epoch(begin(keys)))  # compiles
     agents = begin(keys)
@@ -289,13 +300,49 @@ def by_jax(entry: Entry, seeds: range, epochs: int) -> Runs:
         agents = jax.block_until_ready(epoch(agents))
         seconds += time.process_time() - begun
         scores.append(play(lambda x, agents=agents: np.asarray(act(agents, x)), number + 1))
-    return Runs("JAX, jit and vmap", np.stack(scores, axis=1), seconds / len(seeds))
+    return Runs(name, np.stack(scores, axis=1), seconds / len(seeds))
 
 
-def sb3_ppo(entry: Entry) -> Callable[[Any, int], Any]:
-    """Return a maker of PPO agents at an entry's settings."""
-    from stable_baselines3 import PPO
+def by_rejax(entry: Entry, seeds: range, epochs: int) -> Runs:
+    """Train rejax's PPO, all agents and their environments (gymnax's CartPole) in one compiled epoch."""
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    import jax
+    import rejax
 
+    o, network = entry.algorithm_options, entry.model_options
+    ppo = rejax.PPO.create(
+        env="CartPole-v1",
+        num_envs=ENVIRONMENTS,
+        num_steps=INTERACTIONS // ENVIRONMENTS,
+        num_minibatches=INTERACTIONS // o.batch,
+        num_epochs=o.repeats,
+        total_timesteps=INTERACTIONS * epochs,
+        learning_rate=o.lr,
+        gamma=o.gamma,
+        gae_lambda=o.gae_lambda,
+        clip_eps=o.clip,
+        ent_coef=o.entropy_coefficient,
+        vf_coef=o.value_coefficient,
+        max_grad_norm=float("inf"),
+        agent_kwargs={"hidden_layer_sizes": (network.width,) * network.depth, "activation": "relu"},
+    )
+
+    def act(agent: Any, x: Any) -> Any:
+        return ppo.actor.apply(agent.actor_ts.params, x, method="_action_dist").mode()
+
+    each = (ppo.init_state, ppo.train_iteration, act)
+    return _together("rejax PPO", entry, seeds, epochs, tuple(jax.jit(jax.vmap(f)) for f in each))
+
+
+def sb3_ppo(entry: Entry, jax: bool = False) -> Callable[[Any, int], Any]:
+    """Return a maker of PPO agents at an entry's settings, of SB3's, or of SBX's, which is SB3 in JAX."""
+    if jax:
+        from flax.linen import relu
+        from sbx import PPO
+    else:
+        from stable_baselines3 import PPO
+
+        relu = torch.nn.ReLU
     o, network = entry.algorithm_options, entry.model_options
     layers = [network.width] * network.depth
 
@@ -316,7 +363,7 @@ def sb3_ppo(entry: Entry) -> Callable[[Any, int], Any]:
             max_grad_norm=float("inf"),
             policy_kwargs={
                 "net_arch": {"pi": layers, "vf": layers},
-                "activation_fn": torch.nn.ReLU,
+                "activation_fn": relu,
                 "ortho_init": False,
                 "optimizer_kwargs": {"eps": 1e-8},
             },
@@ -450,7 +497,12 @@ def main() -> None:
         preset = arguments.preset or (None if algorithm == "sac" else "tuned")  # which has nothing for it
         entry = resolve("cartpole", "mlp", algorithm, settings, preset)
         all_runs = [ours(entry, seeds, arguments.epochs)]
-        peers: dict[str, Callable[[Any, int], Any]] = {"SB3 PPO": sb3_ppo(entry)}
+        peers: dict[str, Callable[[Any, int], Any]] = {
+            "SB3 PPO": sb3_ppo(entry),
+            "SBX PPO": sb3_ppo(entry, jax=True),
+        }
+        if algorithm == "ppo":
+            all_runs.append(by_rejax(entry, seeds, arguments.epochs))
         if algorithm == "sac":
             peers = {"CleanRL SAC": functools.partial(CleanSAC, entry)}
         if algorithm == "ddqn":
