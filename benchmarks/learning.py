@@ -1,4 +1,4 @@
-"""Learning on CartPole at equal settings, side by side with Stable-Baselines3, SBX, rejax, CleanRL, JAX and plain torch.
+"""Learning on CartPole at equal settings, beside Stable-Baselines3, SBX, rejax, CleanRL's SAC, JAX and plain torch.
 
     pip install '.[bench]'
     python benchmarks/learning.py [--algorithms ddqn ppo sac] [--seeds 10] [--epochs 100] [--json out.json]
