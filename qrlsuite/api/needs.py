@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
+import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
@@ -16,14 +17,19 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import ranked
+from qrlsuite.leaderboard.shelf.collect import Selection, collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import hours_text
 from qrlsuite.statistics import MIN_RUNS, LearningCurves, SmoothedRuns
 from qrlsuite.statistics.curves import common_horizon
-from qrlsuite.statistics.planning import LADDER, Need, runs_needed, runs_to_detect
-from qrlsuite.statistics.times import mean_time
+from qrlsuite.statistics.permutation import with_half_epoch
+from qrlsuite.statistics.planning import LADDER, Need, chances, runs_needed, runs_to_detect
+from qrlsuite.statistics.times import mean_time, times_below
+from qrlsuite.studies.looks import Study
 
 SLOWER = (0.10, 0.25, 0.50)
+PILOT = 10
+"""Seeds that tell the spread of a study's entries."""
 POWERS = (0.8, 0.9)
 
 
@@ -139,6 +145,63 @@ def power(
         with console.status(Text(f"simulating: {title}")):
             rows += [_row(title, need, per_pair) for need in job()]
     return SeedsNeeded(tuple(entries), horizon, tuple(rows), draws)
+
+
+@dataclass(frozen=True)
+class StudyPower:
+    """How often a study with looks tells an entry with a true lead apart from all others, before it begins.
+
+    Attributes
+    ----------
+    found:
+        For each lead (0.1: needs 10 percent fewer steps than each other entry) the share of studies, by look.
+    spread:
+        Standard deviation of a run's steps over their mean, as `pilot` has it.
+    pilot:
+        The study's entry with most seeds, or one of its task where none of its own has `PILOT` seeds.
+    seeds:
+        The pilot's number of seeds.
+    """
+
+    found: dict[float, tuple[float, ...]]
+    spread: float
+    pilot: str
+    seeds: int
+
+    @property
+    def sentence(self) -> str:
+        """Say the power at the last look."""
+        shares = ", ".join(f"{lead:.0%} fewer in {100 * each[-1]:.0f}" for lead, each in self.found.items())
+        return (
+            f"power: of 100 such studies, this many find an entry that needs fewer steps than every other: {shares}; "
+            f"if seeds differ as the {self.seeds} of {self.pilot} do"
+        )
+
+
+def study_power(study: Study) -> StudyPower | None:
+    """Return a study's power, from seeds that are stored or published; None where its task has no `PILOT` of them."""
+    collected, _ = collect(Selection(study.runs, published=True, tasks=(study.task,)))
+    own = {entry.label for entry in study.entries.values()}
+    task_hash = next(iter(study.entries.values())).task.hash
+    pilots = [
+        each
+        for each in collected
+        if each.task_hash == task_hash
+        and len(each.seeds) >= PILOT
+        and each.curves.shape[1] >= study.epochs
+        and np.isfinite(each.curves).all()
+    ]
+    if not pilots:
+        return None
+    pilot = max(pilots, key=lambda each: (each.record.label in own, len(each.seeds), each.name))
+    curves = ranked.learning_curves(pilot).cut(study.epochs * pilot.steps_per_epoch)
+    times = times_below(curves.values, study.grid, curves.steps_per_epoch)
+    numbers = with_half_epoch(times, curves.steps_per_epoch).sum(axis=-1)
+    spread = float(numbers.std(ddof=1) / numbers.mean())
+    if not spread:
+        return None
+    found = {lead: chances(study.design, spread, lead) for lead in SLOWER}
+    return StudyPower(found, spread, pilot.label, len(pilot.seeds))
 
 
 def _jobs(

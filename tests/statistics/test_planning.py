@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import itertools
 import math
 from dataclasses import replace
 from statistics import NormalDist
@@ -26,8 +27,9 @@ from qrlsuite.statistics import (
     times_below,
 )
 from qrlsuite.statistics.permutation import with_half_epoch
+from qrlsuite.statistics.planning import chances
 from qrlsuite.statistics.sequential import Decision, PairDecision
-from qrlsuite.statistics.simulation import judge_steps
+from qrlsuite.statistics.simulation import judge_steps, play
 from tests.statistics.conftest import SURFACE, entry
 
 PILOT = SmoothedRuns(entry(0))
@@ -112,3 +114,33 @@ def test_runs_that_the_present_difference_needs() -> None:
     assert (planning.runs_at_difference(decision, pair) or 0) > 60, "more power needs more"
     assert planning.runs_at_difference(decision, replace(pair, p=())) is None
     assert planning.runs_at_difference(decision, replace(pair, difference=0.0)) is None
+
+
+def test_chances_are_those_of_played_studies() -> None:
+    """Of pairs that differ by 10 percent, some are told apart, some are equal within the margin, and some stay open."""
+    design = SequentialDesign(("a", "b"), (20, 40, 60), margin=0.2, rule="steps")
+    generator = np.random.default_rng(3)
+    means = (9000, 10_000)
+    drawn = [np.rint(generator.normal(each, 0.2 * each, (400, 60, 1))).astype(np.int64) for each in means]
+    played = play(design, drawn).verdicts[0]
+    found = chances(design, 0.2, 0.1)
+    assert 0.2 < played[Decided.EQUAL] < 0.6
+    assert found[-1] == pytest.approx(played[Decided.FIRST], abs=0.08)
+    assert found[0] < found[1] < found[2]
+    without = chances(replace(design, margin=0.001), 0.2, 0.1)
+    assert without[-1] > found[-1] + 0.1, "a pair that is equal within the margin is told apart no more"
+
+
+def test_chances_of_a_leader_are_those_of_all_its_pairs() -> None:
+    two, three = (
+        chances(SequentialDesign(names, (60,), rule="steps"), 0.2, 0.1)
+        for names in (("a", "b"), ("a", "b", "c"))
+    )
+    assert 0.5 * two[0] < three[0] < two[0] - 0.05
+    others = tuple(itertools.combinations("bcd", 2))
+    design = SequentialDesign(tuple("abcd"), (60,), pairs=(("a", "b"), *others), rule="steps")
+    assert three[0] < chances(design, 0.2, 0.1)[0] < two[0] - 0.05, (
+        "the level of a pair beside three that are equal"
+    )
+    with pytest.raises(OptionError, match="lead"):
+        chances(SequentialDesign(("a", "b"), (60,)), 0.2, 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 
 from qrlsuite import api, registry, specs
 from qrlsuite.api.arguments import where_of
+from qrlsuite.api.needs import PILOT, study_power
 from qrlsuite.api.studies import (
     ALL,
     end_study,
@@ -96,10 +98,15 @@ def new(
     """
     numbers, more = _looks(looks)
     outcome = api.new_study(path, entries, task=task, epochs=epochs, looks=numbers, runs=runs, **more)
+    found = study_power(outcome.study)
     if json_output:
-        typer.echo(json.dumps(outcome.as_dict()))
+        typer.echo(json.dumps({**outcome.as_dict(), "power": None if found is None else asdict(found)}))
         return
     table_console().print(outcome, soft_wrap=True)
+    if found is None:
+        typer.echo(f"power: unknown until {PILOT} seeds of an entry of this task are trained to the end")
+    else:
+        typer.echo(found.sentence)
     typer.echo(f"wrote {path}")
     typer.echo(f"next: {command('study', 'run', str(path), runs=runs)}")
 
