@@ -12,8 +12,9 @@ dataclass, may replace further parameters, as in a package. The name is the func
 hyphens, the summary the first line of its docstring.
 
 A model's class attribute `family = "quantum"` says that it is one; otherwise it is one where its `__init__` or module
-says `qrlsuite.layer`. Class attributes `shared` of a model and `repeats` of an environment are those of the spec.
-Episodes of an environment end after 1000 steps.
+says `qrlsuite.layer`. Class attributes `shared` of a model and `repeats` of an environment are those of the spec. An
+environment's `lanes` is a `qrlsuite.environment.LaneEnv`, called with its options and the number of lanes. Without it,
+episodes end after 1000 steps.
 """
 
 from __future__ import annotations
@@ -373,6 +374,10 @@ def _uses_circuits(cls: type[Any]) -> bool:
 
 def _environment(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
     options, _ = _signature(cls, ())
+    lanes = getattr(cls, "lanes", None)
+
+    def vector(options: Any, num_envs: int) -> Any:
+        return cls.lanes(options, num_envs)
 
     def make(**arguments: Any) -> Any:
         from gymnasium.wrappers import TimeLimit
@@ -385,6 +390,7 @@ def _environment(cls: type[Any], name: str, summary: str, holder: _Holder) -> sp
         options=holder.put("options", options),
         gymnasium_id=f"{holder.module.__name__}/{cls.__name__}-v0",
         entry_point=holder.put("make", make),
+        vector=None if lanes is None else holder.put("vector", vector),
         repeats=getattr(cls, "repeats", False),
     )
 

@@ -671,11 +671,10 @@ def _environment_problems(section: Any) -> list[str]:
 
 
 def is_quick(name: str) -> bool:
-    """Whether a name stands for a task that no file has: `gym:ID`, or an environment without lanes of its own."""
+    """Whether a name stands for a task that no file has: `gym:ID`, or an environment's (`gym` itself lacks an ID)."""
     registered = registry.load()
-    environment = registered.of(specs.EnvironmentSpec).get(name)
-    without_lanes = environment is not None and environment.spec.vector is None
-    return name.startswith("gym:") or (without_lanes and name not in registered.of(specs.TaskSpec))
+    names = registered.of(specs.EnvironmentSpec).keys() - registered.of(specs.TaskSpec).keys()
+    return name.startswith("gym:") or name in names - {"gym"}
 
 
 def is_known(name: str) -> bool:
@@ -687,7 +686,7 @@ def load(name: str) -> Task:
     """Load a registered task by name, a task file by path (anything that ends in `.toml`), or `gym:ID`.
 
     `gym:Acrobot-v1` is a task with settings for a quick look at an environment that Gymnasium knows. So is the name of
-    a registered environment without lanes of its own, where no task has that name.
+    a registered environment, where no task has that name.
     """
     if is_quick(name):
         from qrlsuite.gymlanes import quick_task

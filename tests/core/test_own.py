@@ -22,7 +22,8 @@ from qrlsuite.results.records import EntryRecord, ProbeRecord
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER, in_folder
-from qrlsuite.training.trainer import Trainer, first_network, require_trainable
+from qrlsuite.testing import check
+from qrlsuite.training.trainer import Trainer, build_envs, first_network, require_trainable
 from tests.conftest import cases
 
 RING = '''
@@ -201,6 +202,53 @@ def test_an_environment_has_a_task_of_its_name_for_a_quick_look() -> None:
     entry = resolve("line-walk", "slow http-net2 lr=0.1 scale=2")
     assert entry.algorithm_options.lr == 0.1
     assert first_network(entry).scale == 2, "and it is given what it asks for"
+
+
+def test_an_environment_may_bring_its_lanes() -> None:
+    own.load(
+        write(
+            "fast.py",
+            """
+            from types import SimpleNamespace
+            import numpy as np
+            from gymnasium.spaces import Box, Discrete
+            from qrlsuite.environment import EpisodeLanes, OneLane
+
+            class FastLanes(EpisodeLanes):
+                def __init__(self, options, num_envs):
+                    super().__init__(options, num_envs, Box(0, 1, (1,)), Discrete(2))
+                    self.value = np.zeros(num_envs)
+
+                def _arrays(self):
+                    return {"value": self.value}
+
+                def _draw(self, stream, count):
+                    return stream.random(count)
+
+                def _begin(self, lanes, drawn):
+                    self.value[lanes] = drawn
+
+                def _act(self, actions, running):
+                    return (actions == self.value.round()) * 1.0, np.zeros(self.num_envs, np.bool_)
+
+                def _seen(self):
+                    return self.value[:, None].astype(np.float32)
+
+                def _scores(self):
+                    return self.value * 0
+
+            class Fast(OneLane):
+                lanes = FastLanes
+
+                def __init__(self, steps: int = 5):
+                    super().__init__(FastLanes(SimpleNamespace(steps=steps), 1))
+            """,
+        )
+    )
+    entry = resolve("fast", "mlp steps=7")
+    envs = build_envs(entry, 6, lambda: None).inner
+    assert (type(envs).__name__, envs.num_envs, envs.options.steps) == ("FastLanes", 6, 7)
+    assert all(finding.ok for finding in check("environment", "fast"))
 
 
 def test_an_options_class_is_taken_as_it_is() -> None:

@@ -120,6 +120,11 @@ def test_thresholds_that_random_actions_always_reach_are_left_out() -> None:
         task.load(f"gym:{HERE}:Even-v0")
 
 
+@pytest.mark.parametrize("name", sorted(registry.load().of(specs.EnvironmentSpec).keys() - {"gym"}))
+def test_every_environment_has_a_task(name: str) -> None:
+    assert task.load(name).environment.name == name or name in registry.load().of(specs.TaskSpec)
+
+
 def test_names_of_tasks_without_a_file_are_names() -> None:
     for env_id in ("Acrobot-v1", "phys2d/CartPole-v1", "a.b:C_d/E-v0", "X" * 99, "a" * 59 + "-b"):
         assert specs.NAME.fullmatch(quick_name(env_id))
