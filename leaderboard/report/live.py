@@ -92,7 +92,7 @@ class Live:
         self._problem = "; ".join(status.queue_problem for status in statuses if status.queue_problem)
         self._groups = [group for status in statuses for group in _groups(status)]
         entries = (status.entry for status in statuses)
-        return [(entry.task, entry.name, dict(entry.seeds), entry.epochs, entry.size) for entry in entries]
+        return [(entry.folder, dict(entry.seeds), entry.epochs, entry.size) for entry in entries]
 
 
 def _groups(status: EntryStatus) -> list[dict[str, Any]]:
@@ -106,7 +106,7 @@ def _groups(status: EntryStatus) -> list[dict[str, Any]]:
         running = group.state == "running"
         shown.append(
             {
-                "entry": clean(f"{status.entry.task}, {status.entry.label}"),
+                "entry": clean(f"{status.task}, {status.entry.label} ({status.seeds})"),
                 "seeds": ranges(group.seeds),
                 "state": clean((plain["phase"] or "running") if running else group.state),
                 "epoch": epoch,

@@ -12,7 +12,7 @@ from qrlsuite.engine.where import Queues
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore, entries
-from qrlsuite.results.survey import EntrySurvey, GroupStatus, delete, groups, look
+from qrlsuite.results.survey import STATUSES, EntrySurvey, GroupStatus, delete, groups, look
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,26 @@ class EntryStatus:
     ----------
     queue_problem:
         Why a queue that was handed some of its seeds did not answer; None where each did.
+    study:
+        The study with looks that trains it, in a folder of its own.
     """
 
     entry: EntrySurvey
     groups: tuple[GroupStatus, ...]
     queue_problem: str | None = None
+    study: str | None = None
+
+    @property
+    def task(self) -> str:
+        """The task's name, after the study's."""
+        return self.entry.task if self.study is None else f"{self.study}: {self.entry.task}"
+
+    @property
+    def seeds(self) -> str:
+        """Numbers of seeds by status, and of all that were asked for where more are to come."""
+        there = self.entry.seeds
+        text = ", ".join(f"{there[status]} {status}" for status in STATUSES if there.get(status)) or "none"
+        return f"{text} of {self.entry.asked}" if self.entry.asked > sum(there.values()) else text
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -35,6 +50,7 @@ class EntryStatus:
             **dataclasses.asdict(self.entry),
             "folder": str(self.entry.folder),
             "queue_problem": self.queue_problem,
+            "study": self.study,
             "groups": [
                 {
                     "seeds": list(group.seeds),
@@ -51,12 +67,12 @@ class EntryStatus:
         }
 
 
-def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
-    """Look at every entry of a results folder, or of one task in it; disturbs no worker."""
+def survey(runs: Path, task: str | None = None, studies: Sequence[Path] = ()) -> list[EntryStatus]:
+    """Look at every entry of a results folder and of studies in it, or of one task; disturbs no worker."""
     name = lookup.task_name(runs, task)
     statuses = []
     queues = Queues()
-    for store in entries(runs, name):
+    for store in (store for folder in (runs, *studies) for store in entries(folder, name)):
         entry, queued, problem = look(store), None, None
         if entry.seeds.get("submitted"):
             try:
@@ -64,7 +80,8 @@ def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
                 entry = look(store, queued)
             except QrlSuiteError as error:
                 problem = str(error)
-        statuses.append(EntryStatus(entry, tuple(groups(store, queued)), problem))
+        study = store.path.parents[1].name if store.path.parents[1] in studies else None
+        statuses.append(EntryStatus(entry, tuple(groups(store, queued)), problem, study))
     return statuses
 
 

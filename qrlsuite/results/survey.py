@@ -33,6 +33,8 @@ class EntrySurvey:
     ----------
     seeds:
         Number of seeds by status.
+    asked:
+        Number of seeds that were asked for; 0 without a record.
     epochs:
         Fewest and most epochs that a seed has recorded; None if no seed has begun.
     size:
@@ -48,6 +50,7 @@ class EntrySurvey:
     name: str
     label: str
     seeds: Mapping[str, int]
+    asked: int
     epochs: tuple[int, int] | None
     size: int
     last_activity: float
@@ -74,6 +77,11 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
         problems.append(str(error))
         record = None
     statuses, epochs = _seeds(store, problems, queued)
+    try:
+        asked = len(requests.read(store)[0])
+    except StoreError as error:
+        problems.append(str(error))
+        asked = 0
     size, newest = _usage(store.path)
     return EntrySurvey(
         folder=store.path,
@@ -81,6 +89,7 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
         name=store.path.name,
         label=f"{'?' if record is None else record.label} {store.mark}".rstrip(),
         seeds=dict(Counter(statuses.values())),
+        asked=asked,
         epochs=(min(epochs), max(epochs)) if epochs else None,
         size=size,
         last_activity=newest,

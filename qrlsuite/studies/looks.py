@@ -330,6 +330,11 @@ class Study:
         return replace(state, taken=taken)
 
 
+def folders(runs: Path) -> list[Path]:
+    """Return the folders of the studies that have begun in a results folder."""
+    return [path.parent for path in sorted((runs / FOLDER).glob(f"*/{FILE}"))]
+
+
 def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[State], list[str]]:
     """Return the outcomes of the studies that have begun in a results folder, and a line for each unreadable study.
 
@@ -339,9 +344,9 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[State], list[
         Only studies of these tasks; all where empty.
     """
     outcomes, refused = [], []
-    for path in sorted((runs / FOLDER).glob(f"*/{FILE}")):
+    for path in folders(runs):
         try:
-            study = Study(load_kept(path), runs)
+            study = Study(load_kept(path / FILE), runs)
             if study.begun and (not tasks or study.task in tasks):
                 outcomes.append(study.read())
         except QrlSuiteError as error:

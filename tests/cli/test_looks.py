@@ -207,6 +207,8 @@ def test_ctrl_c_between_groups_changes_no_decision() -> None:
         words = ("widths.toml", "--runs", f"runs-{interrupted}")
         assert say("study", "run", *words, "--engine", "scripted").exit_code == 130
         Scripted.interrupt_at = -1
+        rows = [line for line in say("runs", *words[1:]).output.splitlines() if line.startswith("widths: ")]
+        assert (len(rows), "  none of 20  " in rows[-1]) == (min(interrupted + 1, 3), interrupted == 1)
         assert run(*words)["pairs"] == straight["pairs"]
         assert len(Scripted.trained) == 5, "nothing is trained twice"
 

@@ -85,7 +85,7 @@ def test_a_browser_follows_a_run(
     row.get_by_text("of 8").first.wait_for()  # it is held in its first epoch
     assert row.locator("progress").get_attribute("max") == "8"
     told = tab.evaluate("fetch('/progress').then((answer) => answer.json())")
-    assert {(group["entry"], group["seeds"]) for group in told["groups"]} <= {
+    assert {(group["entry"].partition(" (")[0], group["seeds"]) for group in told["groups"]} <= {
         ("tiny, ddqn mlp width=8", seeds) for seeds in ("0", "1", "0-1")
     }
 
@@ -114,6 +114,22 @@ def test_a_browser_follows_a_run(
     assert tab.locator("#board-0-table tbody tr:visible", has_text="width=4").count() == 0
     tab.close()
     assert trouble == []
+
+
+def test_it_shows_what_a_study_trains(view: View, tiny_task: str, tmp_path: Path, hold: Hold) -> None:
+    study, runs = str(tmp_path / "widths.toml"), ("--runs", str(tmp_path / "runs"))
+    words = ("mlp width=4", "mlp width=2", "--task", tiny_task, "--epochs", "2", "--looks", "2 reason=test")
+    assert qrlsuite("study", "new", study, *words, *runs).returncode == 0
+    run = start("study", "run", study, "--workers", "1", *runs, env=hold.environment)
+    hold.wait(run)
+    _, address = view()
+    [group] = json.loads(answer(address, "/progress")[1])["groups"]
+    assert (group["entry"], group["seeds"]) == ("widths: tiny, ddqn mlp width=4 (2 running)", "10000-10001")
+    [status] = json.loads(qrlsuite("runs", "--json", *runs).stdout)
+    assert (status["study"], status["asked"], status["seeds"]) == ("widths", 2, {"running": 2})
+    assert "widths: tiny  ddqn-mlp" in qrlsuite("runs", *runs).stdout
+    hold.release()
+    run.wait(HANGS)
 
 
 def test_ctrl_c_ends_it_with_a_sentence_and_nothing_is_changed(

@@ -19,8 +19,9 @@ from qrlsuite.notation import parse_named
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds, parse_seeds
 from qrlsuite.results.store import EntryStore
-from qrlsuite.results.survey import STATUSES, EntrySurvey, garbage, remove, withdraw
+from qrlsuite.results.survey import garbage, remove, withdraw
 from qrlsuite.results.text import counted, duration, size_text
+from qrlsuite.studies import looks
 
 app = typer.Typer(invoke_without_command=True)
 
@@ -40,7 +41,8 @@ def runs(
 ) -> None:
     """List the results folder: task, entry, seeds by status, epochs, size on disk, last activity.
 
-    Under an entry stand its groups of seeds that run, wait or stopped, from any machine that sees the folder.
+    Under an entry stand its groups of seeds that run, wait or stopped, from any machine that sees the folder. Entries
+    of studies come last, the study before their task.
     Workers are not disturbed. Where seeds were submitted to a queue, the queue is asked whether it still has them.
 
     Examples: qrlsuite runs --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
@@ -53,7 +55,7 @@ def runs(
                     f"put options after the action: qrlsuite runs {action} --task TASK --runs DIR"
                 )
         return
-    statuses = survey(runs, task)
+    statuses = survey(runs, task, [] if format_ == "csv" else looks.folders(runs))
     if format_ == "csv":
         typer.echo(csv_rows(progress_table(runs, statuses)), nl=False)
         return
@@ -69,7 +71,7 @@ def runs(
     now = time.time()
     table = [
         ("task", "entry", "label", "seeds", "epochs", "size", "last activity"),
-        *(_row(status.entry, now) for status in statuses),
+        *(_row(status, now) for status in statuses),
     ]
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
     if sum(widths) + 2 * len(widths) > table_console(10_000).width:  # the label names the entry as well
@@ -180,15 +182,14 @@ def _withdrawn(text: str) -> tuple[list[int], str]:
     return parse_seeds(seeds), reason
 
 
-def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
-
-    seeds = ", ".join(f"{entry.seeds[status]} {status}" for status in STATUSES if entry.seeds.get(status))
+def _row(status: EntryStatus, now: float) -> tuple[str, ...]:
+    entry = status.entry
     low, high = entry.epochs or (0, 0)
     return (
-        printable(entry.task),
+        printable(status.task),
         printable(entry.name),
         printable(entry.label),
-        seeds or "none",
+        status.seeds,
         f"{low}" if low == high else f"{low} to {high}",
         size_text(entry.size),
         f"{duration(max(0.0, now - entry.last_activity))} ago",

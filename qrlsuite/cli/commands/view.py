@@ -15,6 +15,7 @@ from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.report.live import Live, Server, serve
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.collect import Selection
+from qrlsuite.studies import looks
 
 
 def view(
@@ -46,7 +47,11 @@ def view(
         typer.echo(f"reading {runs} ...")
         live = Live(
             render,
-            lambda: survey(runs, next(iter(selection.tasks), None)) if runs.is_dir() or not published else [],
+            lambda: (
+                survey(runs, next(iter(selection.tasks), None), looks.folders(runs))
+                if runs.is_dir() or not published
+                else []
+            ),
         )
         typer.echo(f"{runs} is shown to browsers on this machine, until Ctrl-C, at {server.address}")
         serve(server, live)
