@@ -153,6 +153,12 @@ def _sweep_of(population: nn.Module) -> Sweep | None:
     return None if found is None else found()
 
 
+def sweeps(*populations: nn.Module) -> list[Sweep] | None:
+    """Return populations as compiled sweeps, so that an algorithm need not go through autograd; None if one is none."""
+    found = [_sweep_of(each) for each in populations]
+    return None if None in found else cast("list[Sweep]", found)
+
+
 def best(population: nn.Module, x: Tensor) -> Tensor:
     """Return which output is the largest (S, B), the first of equal ones, for x (S, B, in)."""
     whole = _sweep_of(population)

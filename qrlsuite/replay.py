@@ -67,25 +67,28 @@ class Replay:
         draws:
             (S, B) float64, uniform in [0, 1): they choose stored rows, with replacement.
         """
+        return self.at((draws * self.filled).to(torch.int64))
+
+    def at(self, places: Tensor) -> dict[str, Tensor]:
+        """Return the rows at `places` (S, B) of every seed, as `batch` does."""
         seeds, capacity, numbers = self.rows.shape
         if self.rows.is_cpu:
-            return self._picked(draws)
-        picked = (draws * self.filled).to(torch.int64)
+            return self._picked(places)
         offset = torch.arange(seeds, device=self.rows.device)[:, None] * capacity
-        found = self.rows.view(-1, numbers)[(picked + offset).reshape(-1)].view(seeds, -1, numbers)
+        found = self.rows.view(-1, numbers)[(places + offset).reshape(-1)].view(seeds, -1, numbers)
         parts = torch.split(found, list(self.columns.values()), dim=2)
         return {name: part.contiguous() for name, part in zip(self.columns, parts)}
 
-    def _picked(self, draws: Tensor) -> dict[str, Tensor]:
-        """Like `batch`, by one compiled loop."""
+    def _picked(self, places: Tensor) -> dict[str, Tensor]:
+        """Like `at`, by one compiled loop."""
         from qrlsuite.compiled.networks import pick
 
-        seeds, batch = draws.shape
+        seeds, batch = places.shape
         samples, parts = seeds * batch, {}
         out, first = np.empty(samples * self._borders[-1], np.float32), 0
         begin = self._starts * np.uint64(samples) + self._within
         rows = self.rows.view(-1).numpy()
-        pick(rows, self.rows.shape[1], draws.contiguous().numpy(), self.filled, begin, self._widths, out)
+        pick(rows, self.rows.shape[1], places.contiguous().numpy(), begin, self._widths, out)
         for (name, width), end in zip(self.columns.items(), self._borders[1:]):
             parts[name] = torch.from_numpy(out[first : samples * end].reshape(seeds, batch, width))
             first = samples * end

@@ -42,6 +42,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
             actions=("discrete", "box", "multi-discrete", "multi-binary"),
             unusable="qrlsuite.plugins.algorithms:unusable_ppo",
+            numerics=2,
         )
     )
     register(

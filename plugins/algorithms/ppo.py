@@ -51,7 +51,7 @@ Deviations from the paper (its algorithm 'Estimating the Sample Complexity of PP
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -75,11 +75,18 @@ from qrlsuite.population import (
     prefixed,
     remember,
     remembers,
+    sweeps,
     unroll,
 )
+from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
+if TYPE_CHECKING:
+    from qrlsuite.compiled.perceptron import Sweep
+    from qrlsuite.compiled.policies import Pull
+
 FloatArray = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -172,6 +179,12 @@ class Choices:
             entropies.append(-(log_policy.exp() * log_policy).sum(-1))
         return _total(log_probs), _total(entropies)
 
+    def compiled(self, outputs: Array, chosen: Array) -> tuple[Array, Array, Pull]:
+        """Return what `judge` returns, and the function that autograd would be, see `qrlsuite.compiled.policies`."""
+        from qrlsuite.compiled.policies import judge_choices
+
+        return judge_choices(outputs, self.sizes, chosen)
+
     def information(self, outputs: FloatArray) -> FloatArray:
         """Return the Fisher information (..., outputs, outputs) of pi."""
         return information_of_choices(outputs, self.sizes)
@@ -221,6 +234,21 @@ class Gaussian(nn.Module):
         away = (chosen - outputs) * (-log_spread).exp()
         log_probs = (-0.5 * away.square() - log_spread - HALF_LOG_2_PI).sum(-1)
         return log_probs, (log_spread + 0.5 + HALF_LOG_2_PI).sum(-1)
+
+    def compiled(self, outputs: Array, chosen: Array) -> tuple[Array, Array, Pull]:
+        """Return what `Choices.compiled` returns; the function sets the gradient of the spreads, too."""
+        means, drawn = torch.from_numpy(outputs), torch.from_numpy(chosen)
+        with torch.no_grad():
+            log_probs, entropies = self.judge(means, drawn)
+            narrow = (-self._spread(means)).exp()
+
+        def pull(slopes: Array, entropy_slope: float) -> Array:
+            own, away = torch.from_numpy(slopes)[..., None], (drawn - means) * narrow
+            self.log_spread.grad = (own * (away.square() - 1.0) + entropy_slope).cumsum(1)[:, -1]
+            cotangents: Array = (own * away * narrow).numpy()
+            return cotangents
+
+        return log_probs.numpy(), entropies.numpy(), pull
 
     def information(self, outputs: FloatArray) -> FloatArray:
         """Return the Fisher information (S, ..., numbers, numbers) of pi, by its means."""
@@ -328,6 +356,9 @@ class PPO:
         self.adams = [self.actor_adam, self.critic_adam]
         clip: Any = options.clip
         self.clip: tuple[Any, Any] = (1.0 - clip, 1.0 + clip)
+        self.ends = [
+            np.full(self.S, end, np.float64) for end in (1.0 - np.asarray(clip), 1.0 + np.asarray(clip))
+        ]
         if isinstance(clip, Tensor):  # each agent's own, (S, 1)
             self.clip = tuple(end.to(device, torch.float32)[:, None] for end in self.clip)
         if isinstance(self.policy, Gaussian):
@@ -365,32 +396,20 @@ class PPO:
         for adam in self.adams:
             adam.decay(self.epoch * rounds * self.E, self.options.decay_steps)
         rollout = self._collect(rounds)
-        advantages, returns, critic_remembered = self._estimate(rollout)
-        states = rollout.states.flatten(0, 1)
-        # one row per quantity and not one per sample: every minibatch column is then contiguous
-        columns = torch.stack([rollout.log_probs, advantages, returns, rollout.begins]).view(4, -1)
-        actions = rollout.actions.reshape(-1, self.policy.numbers)
-        memories = [each.flatten(0, 1) for each in (rollout.remembered, critic_remembered)]
+        samples = self._samples(rollout)
         sequences = self._sequences(rounds)
         length = sequences.shape[1]
-        total = torch.zeros((4, self.S), device=self.device)
-        steps = 0
-        for order in self._orders(len(sequences) // self.S):  # (S, n), into the flattened S x n sequences
+        total, steps = torch.zeros((4, self.S), device=self.device), 0
+        for order in self._orders(len(sequences)):  # (S, n)
+            places = sequences[order]
             for piece in minibatches(order.shape[1], max(1, self.options.batch // length)):
-                chosen = sequences[order[:, piece].reshape(-1)]
-                picked = chosen.reshape(-1)
-                *judged, begins = columns.index_select(1, picked).view(4, self.S, -1)
-                per_agent = (self.S, len(chosen) // self.S)
+                batch = samples.at(places[:, piece].flatten(1))
+                seen, action, log_prob, advantage, aim, begins, first, second = batch.values()
+                shape = (self.S, begins.shape[1] // length, length)
                 total += self._learn(
-                    states.index_select(0, picked).view(self.S, -1, states.shape[1]),
-                    actions.index_select(0, picked).view(self.S, -1, self.policy.numbers),
-                    *judged,
-                    begins.view(*per_agent, length),
-                    *(
-                        each.index_select(0, chosen[:, 0]).view(*per_agent, each.shape[1])
-                        for each in memories
-                    ),
-                )
+                    seen, action.to(rollout.actions.dtype), *(each.squeeze(2) for each in (log_prob, advantage, aim)),
+                    begins.view(shape), *(each.view(*shape, each.shape[2])[:, :, 0] for each in (first, second)),
+                )  # fmt: skip
                 steps += 1
         self.epoch += 1
         self._validation = []
@@ -398,21 +417,32 @@ class PPO:
         metrics = dict(zip(("policy_loss", "value_loss", "entropy", "kl"), means))
         return metrics | self.actor_adam.gradient_norms()
 
+    def _samples(self, rollout: Rollout) -> Replay:
+        """Return a rollout's samples with their advantages, returns and the networks' memories, to draw batches."""
+        advantages, returns, critic_remembered = self._estimate(rollout)
+        columns = {
+            "seen": rollout.states, "action": rollout.actions, "log_prob": rollout.log_probs[..., None],
+            "advantage": advantages[..., None], "return": returns[..., None], "begins": rollout.begins[..., None],
+            "actor_memory": rollout.remembered, "critic_memory": critic_remembered,
+        }  # fmt: skip
+        widths = {name: each.shape[2] for name, each in columns.items()}
+        samples = Replay(self.S, rollout.states.shape[1], self.device, **widths)
+        samples.add(**columns)
+        return samples
+
     def _sequences(self, rounds: int) -> Tensor:
-        """Return the samples of all sequences (S x n, length), numbered through the flattened S x N samples."""
+        """Return the samples of all sequences (n, length), numbered through the N samples of a seed."""
         length = min(self.options.length, rounds) if self.remembers else 1
         first = np.linspace(0, rounds - length, -(-rounds // length)).round().astype(np.int64)
         step = first[:, None, None] + np.arange(length)  # (n / E, 1, length)
         samples = (step * self.E + np.arange(self.E)[:, None]).reshape(-1, length)
-        offset = np.arange(self.S)[:, None, None] * rounds * self.E
-        return torch.from_numpy((samples + offset).reshape(-1, length)).to(self.device)
+        return torch.from_numpy(samples).to(self.device)
 
     def _orders(self, samples: int) -> Tensor:
-        """Draw every pass's order (repeats, S, N); positions count through the flattened S x N samples."""
+        """Draw every pass's order of a seed's samples (repeats, S, N)."""
         straight = np.tile(np.arange(samples), (self.options.repeats, 1))
         drawn = [s.numpy("minibatches", self.epoch).permuted(straight, axis=1) for s in self.streams]
-        offset = np.arange(self.S)[:, None] * samples
-        return torch.from_numpy(np.stack(drawn, axis=1) + offset).to(self.device)
+        return torch.from_numpy(np.stack(drawn, axis=1)).to(self.device)
 
     def _collect(self, rounds: int) -> Rollout:
         """Step every environment `rounds` times with the stochastic policy."""
@@ -424,13 +454,14 @@ class PPO:
         states = torch.empty((*shape, self.observations.shape[2]), device=self.device)
         arrivals = torch.empty((*shape, self.obs_dim), device=self.device)
         outputs = torch.empty((*shape, self.policy.outputs), device=self.device)
-        begins = torch.empty(shape, device=self.device)
-        chosen, remembered = [], []
+        begun, chosen, remembered = [self.begins], [], []
         rewards = np.empty(shape)
         terminated, truncated = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
         for k in range(rounds):
-            states[:, k], begins[:, k] = self.observations, self.begins
-            remembered.append(self.actor_memory * (1.0 - self.begins)[..., None])
+            states[:, k] = self.observations
+            if self.remembers:
+                self.actor_memory = self.actor_memory * (1.0 - self.begins)[..., None]
+            remembered.append(self.actor_memory)
             with torch.no_grad():
                 plain = masks.observed(self.observations, self.obs_dim)
                 free, self.actor_memory = remember(self.actor, plain, remembered[k])
@@ -444,16 +475,21 @@ class PPO:
             terminated[:, k] = np.reshape(terminal, (self.S, self.E))
             truncated[:, k] = np.reshape(limit, (self.S, self.E))
             self.begins = by_seed(terminal | limit, self.S, self.device)[..., 0]
+            begun.append(self.begins)
         actions = torch.stack(chosen, 1)  # (S, rounds, E, numbers)
         samples = (self.S, rounds * self.E)
+        outputs, actions = outputs.view(*samples, -1), actions.view(*samples, -1)
         with torch.no_grad():
-            log_probs, _ = self.policy.judge(outputs, actions)
+            if self._sweeps() is None:
+                log_probs, _ = self.policy.judge(outputs, actions)
+            else:
+                log_probs = torch.from_numpy(self.policy.compiled(outputs.numpy(), actions.numpy())[0])
         return Rollout(
             states.view(*samples, -1),
             arrivals.view(*samples, -1),
-            actions.view(*samples, -1),
-            log_probs.view(samples),
-            begins.view(samples),
+            actions,
+            log_probs,
+            torch.stack(begun[:-1], 1).view(samples),
             torch.stack(remembered, 1).flatten(1, 2),
             rewards,
             terminated,
@@ -534,7 +570,11 @@ class PPO:
         Tensor
             Policy loss, value loss, entropy and divergence (4, S).
         """
-        o = self.options
+        o, whole = self.options, self._sweeps()
+        if whole is not None:
+            measured = self._slopes(whole, states, actions, old_log_probs, advantages, returns)
+            self._step()
+            return measured
         plain = masks.observed(states, self.obs_dim)
         free = masks.masked(_outputs(self.actor, plain, *memory[:2]), states, self.obs_dim)
         log_probs, entropies = self.policy.judge(free, actions)
@@ -554,13 +594,39 @@ class PPO:
         for adam in self.adams:
             adam.zero_grad()
         torch.autograd.backward(losses.sum())
-        if o.longest_gradient is not None:
-            spreads = [self.policy] if isinstance(self.policy, Gaussian) else []
-            clip_gradients(o.longest_gradient, self.actor, self.critic, *spreads)
-        for adam in self.adams:
-            adam.step()
+        self._step()
         with torch.no_grad():
             return torch.stack([policy_loss, value_loss, entropy, -log_ratio.mean(1)])
+
+    def _sweeps(self) -> list[Sweep] | None:
+        """Return actor and critic as compiled sweeps, which learn without autograd; None where one is none."""
+        return None if self.remembers or self.device.type != "cpu" else sweeps(self.actor, self.critic)
+
+    def _slopes(self, networks: Sequence[Sweep], seen: Tensor, actions: Tensor, *judged: Tensor) -> Tensor:
+        """Set the gradients of `_learn` by its formulas' derivatives; returns the same numbers."""
+        from qrlsuite.compiled.policies import proximal
+
+        o, plain = self.options, masks.observed(seen, self.obs_dim).numpy()
+        (outputs, actor_records), (values, critic_records) = (each.values(plain, True) for each in networks)
+        free = masks.masked(torch.from_numpy(outputs), seen, self.obs_dim)
+        log_probs, entropies, pull = self.policy.compiled(free.numpy(), actions.contiguous().numpy())
+        slopes, value_slopes = np.empty_like(log_probs), np.empty_like(values)
+        measured = np.empty((4, self.S))
+        proximal(
+            log_probs, entropies, *(each.contiguous().numpy() for each in judged), values, *self.ends,
+            np.inf if o.value_clip is None else o.value_clip, o.value_coefficient, slopes, value_slopes, measured,
+        )  # fmt: skip
+        networks[0].set_gradients(actor_records, pull(slopes, -o.entropy_coefficient / slopes.shape[1]))
+        networks[1].set_gradients(critic_records, value_slopes)
+        return torch.from_numpy(measured)
+
+    def _step(self) -> None:
+        """Make an Adam step of every agent."""
+        if self.options.longest_gradient is not None:
+            spreads = [self.policy] if isinstance(self.policy, Gaussian) else []
+            clip_gradients(self.options.longest_gradient, self.actor, self.critic, *spreads)
+        for adam in self.adams:
+            adam.step()
 
     @torch.no_grad()
     def act(

@@ -303,11 +303,13 @@ def backward(
             for j in range(o):
                 gradient = gradients[place + (s * o + j) * i : place + (s * o + j + 1) * i]
                 if i >= o:
+                    own = sums[at + j * columns : at + (j + 1) * columns]  # of slices, see `adam`
                     for k in range(i):  # of `gradient[:] = ...` numba would compile a check of shapes, too
-                        gradient[k] = sums[at + j * columns + k]
+                        gradient[k] = own[k]
                 else:
+                    own = sums[at + j : at + i * columns]
                     for k in range(i):
-                        gradient[k] = sums[at + k * columns + j]
+                        gradient[k] = own[k * columns]
             at += min(i, o) * columns
 
 
@@ -356,19 +358,19 @@ def chosen_errors(values: Any, places: Any, aims: Any, share: Any, errors: Any, 
 
 
 @kernel
-def pick(rows: Any, capacity: int, draws: Any, filled: int, first: Any, width: Any, out: Any) -> None:
-    """Write rows (S, capacity, N), drawn by numbers (S, B) in [0, 1) among the first `filled`, in blocks of columns.
+def pick(rows: Any, capacity: int, places: Any, first: Any, width: Any, out: Any) -> None:
+    """Write rows (S, capacity, N) at `places` (S, B) in blocks of columns.
 
     Parameters
     ----------
     first, width:
         Of each column, its place in the first row of its block in `out`, and the numbers of a row there.
     """
-    seeds, batch = draws.shape
+    seeds, batch = places.shape
     columns = np.uint64(len(first))
     for s in range(seeds):
         for b in range(batch):
-            begin = np.uint64(s * capacity + int(draws[s, b] * filled)) * columns
+            begin = np.uint64(s * capacity + places[s, b]) * columns
             sample = np.uint64(s * batch + b)
             for c in range(columns):
                 out[first[c] + sample * width[c]] = rows[begin + c]

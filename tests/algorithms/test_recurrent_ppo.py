@@ -27,12 +27,10 @@ def made(model: str = "gru", seeds: int = 2, **settings: Any) -> PPO:
 @pytest.mark.parametrize(("rounds", "length"), [(12, 4), (11, 4), (3, 4), (7, 1)])
 def test_sequences_are_consecutive_steps_and_leave_none_out(rounds: int, length: int) -> None:
     ppo = made(length=length)
-    found = ppo._sequences(rounds).view(2, -1, min(rounds, length))
-    for s, sequences in enumerate(found):
-        numbers = sequences - s * rounds * LANES
-        assert (torch.diff(numbers, dim=1) == LANES).all()
-        assert sorted(set(numbers.reshape(-1).tolist())) == list(range(rounds * LANES))
-    assert found.shape[1] == LANES * -(-rounds // length)
+    found = ppo._sequences(rounds)
+    assert (torch.diff(found, dim=1) == LANES).all()
+    assert sorted(set(found.reshape(-1).tolist())) == list(range(rounds * LANES))
+    assert found.shape == (LANES * -(-rounds // length), min(rounds, length))
 
 
 def replayed(network: nn.Module, s: int, states: Tensor, begins: Tensor) -> Tensor:
@@ -85,11 +83,11 @@ def test_it_learns_from_what_it_remembered_when_it_acted() -> None:
             flat = picked.reshape(-1)
             seen = _outputs(
                 network,
-                rollout.states.flatten(0, 1)[flat].view(2, -1, ppo.obs_dim),
-                rollout.begins.flatten()[flat].view(2, -1, 4),
-                remembered.flatten(0, 1)[picked[:, 0]].view(2, -1, 6),
+                rollout.states[:, flat],
+                rollout.begins[:, flat].view(2, -1, 4),
+                remembered[:, picked[:, 0]],
             )
-            torch.testing.assert_close(seen, whole.flatten(0, 1)[flat].view_as(seen))
+            torch.testing.assert_close(seen, whole[:, flat])
     before = {name: value.clone() for name, value in ppo.critic.state_dict().items()}
     ppo.train_epoch(11)
     assert not any(torch.equal(value, ppo.critic.state_dict()[name]) for name, value in before.items())

@@ -32,9 +32,13 @@ RUNS = [path.parent for version in VERSIONS for path in sorted(version.glob("int
 HADAMARDS = "v0.1.1"
 """Since this version Hadamards join blocks, which rounds circuits differently: those that earlier versions began are
 compared number by number, everything else byte by byte."""
-SWEEPS = "v0.2.0"
-"""Since this version the layers of networks are compiled sweeps, which round differently (`numerics` 2): what earlier
-versions began is another entry, and trained anew it is compared number by number."""
+CHANGES = {
+    "mlp": ("v0.2.0", "model 'mlp' has numerics 2, and had 1"),
+    "ppo": ("v0.2.1", "algorithm 'ppo' has numerics 2, and had 1"),
+}
+"""By part, the version since which its bits are others: layers of networks are compiled sweeps, and those learn without
+autograd. Seeds that earlier versions began are another entry. Networks trained anew are compared number by number;
+circuits have the same bits."""
 TOLERANCE = 1e-4
 """With torch's kernels for other processors (ATEN_CPU_CAPABILITY=default) lines differ by 1e-7 at most. Parameters are
 not compared: angles without influence on the result follow rounding errors alone, and Adam makes steps of them."""
@@ -79,14 +83,18 @@ def test_runs_end_as_they_did(
     else:
         shutil.copy(run / "entry.json", folder)
     version = run.parents[2]
-    other_bits = version.name < (HADAMARDS if "-vqc-" in run.name else SWEEPS)
-    if begun and other_bits and "-mlp-" in run.name:
-        with pytest.raises(ChangedCodeError, match="model 'mlp' has numerics 2, and had 1"):
+    changes = [
+        why for part, (since, why) in CHANGES.items() if part in run.name.split("-") and version.name < since
+    ]
+    other_bits = version.name < HADAMARDS if "-vqc-" in run.name else bool(changes)
+    if begun and changes:
+        with pytest.raises(ChangedCodeError) as refused:
             train_group(folder, SEEDS, EPOCHS)
+        assert all(why in str(refused.value) for why in changes)
         entry = EntryStore(folder).entry()
         missing.settle_codes(tmp_path, [entry], Where.create())
         assert missing.find(tmp_path, entry, Where.create()).store.mark
-        assert capsys.readouterr().err.count("model 'mlp' has numerics 2, and had 1. Begun anew is '") == 1
+        assert capsys.readouterr().err.count(f"{changes[0]}. Begun anew is '") == 1
         return
     train_group(folder, SEEDS, EPOCHS)
     same_bits = stored(version, "machine") == machine() and not other_bits
