@@ -374,7 +374,7 @@ def pair_on(
         alpha=board.alpha,
         direction=board.directions[i][j],
         p=float(board.adjusted[i, j]),
-        p_error=0.0,
+        p_error=float(board.p_error[i, j]),
         difference=np.array([board.difference[i, j], *board.difference_interval[i, j]]),
         detectable=math.nan,
         failed=(board.failed[i], board.failed[j]),

@@ -14,7 +14,7 @@ from typing import Any
 from qrlsuite.leaderboard.boards.columns import ranks_text
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.text import interval_text, percent
+from qrlsuite.results.text import interval_text, p_text, percent
 from qrlsuite.statistics import (
     Direction,
     Grid,
@@ -113,10 +113,11 @@ class TimeRanking:
     def special(self) -> list[str]:
         """Name every pair whose decision more relabelings could turn."""
         return [
-            f"within Monte Carlo error of its level after 10 million relabelings: {self._label(i)} and {self._label(j)}"
+            f"within Monte Carlo error of its level after 10 million relabelings: {self._label(i)} and "
+            f"{self._label(j)}, adjusted p = {p_text(self.board.adjusted[i, j])} +- {self.board.p_error[i, j]:.1g}"
             for place, i in enumerate(self.order)
             for j in self.order[place + 1 :]
-            if self.board.turns[i, j]
+            if self.board.p_error[i, j]
         ]
 
     def as_dict(self) -> dict[str, Any]:

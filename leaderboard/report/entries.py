@@ -12,9 +12,9 @@ import numpy as np
 
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
-from qrlsuite.leaderboard.report.words import ranges
 from qrlsuite.leaderboard.shelf.curves import EntryResults, registered_task
 from qrlsuite.notation import write_setting
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted, hours_text
 
 LONGEST_COMMAND = 1000
@@ -90,8 +90,8 @@ def _facts(entry: EntryResults) -> list[tuple[str, str]]:
         ("Model", clean(entry.model)),
         ("Parameters", "" if entry.parameters_text() == "-" else counts),
         ("Agents", f"of {counted(len(entry.agents), 'seed')}" if entry.agents else ""),
-        ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
-        ("Unfinished seeds", ranges(entry.left_out)),
+        ("Seeds", f"{len(entry.seeds)} ({format_seeds(entry.seeds)})"),
+        ("Unfinished seeds", format_seeds(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
         ("Core-hours", hours_text(entry.hours) if entry.hours else ""),
         ("Circuit executions", _told(entry.executions)),

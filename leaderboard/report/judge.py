@@ -74,14 +74,6 @@ class Judgement:
         key = (min(one, other), max(one, other))
         return next(pair for pair in self.pairs if (pair.first, pair.second) == key)
 
-    def beats(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
-        """Return, shape (M, M), whether the row's entry outperforms the column's."""
-        matrix = np.zeros((len(self.entries), len(self.entries)), dtype=bool)
-        for pair in self.pairs:
-            for one, other in ((pair.first, pair.second), (pair.second, pair.first)):
-                matrix[one, other] = pair.outcome(one) is Outcome.OUTPERFORMS
-        return matrix
-
 
 def judge(section: Section) -> Judgement:
     """Return the pairs of a section, in the order of its rows, with the evidence of each verdict."""

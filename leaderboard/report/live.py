@@ -21,7 +21,7 @@ from typing import Any
 from qrlsuite.engine.status import EntryStatus
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard.report.encode import clean
-from qrlsuite.leaderboard.report.words import ranges
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import duration
 
 HOST = "127.0.0.1"
@@ -107,7 +107,7 @@ def _groups(status: EntryStatus) -> list[dict[str, Any]]:
         shown.append(
             {
                 "entry": clean(f"{status.task}, {status.entry.label} ({status.seeds})"),
-                "seeds": ranges(group.seeds),
+                "seeds": format_seeds(group.seeds),
                 "state": clean((plain["phase"] or "running") if running else group.state),
                 "epoch": epoch,
                 "epochs": epochs,

@@ -525,17 +525,19 @@ class TimingLine(Record):
 
 
 class DecidedPair(Record):
-    """Two entries of a study at a look, with their p and the decision, if any."""
+    """Two entries of a study at a look, with their p and the decision, if any; by rule `steps` with p's relabelings."""
 
     pair: list[str]
     p: Annotated[float | None, Field(ge=0, le=1)] = None
     decided: str | None = None
+    relabelings: Count | None = None
 
 
 class LookLine(Record):
     """An event of the study whose hash is `plan`: it was begun or ended, or a look was taken at so many seeds.
 
-    `seeds` is where the block of a study that was begun starts and stops; older lines leave it to the study's file.
+    `seeds` is where the block of a study that was begun starts and stops; older lines leave it to the study's file. By
+    rule `steps`, a look has the seed of its relabelings and a digest of the curves that it saw; older lines have none.
     """
 
     what: ClassVar[str] = "a line of a study's log"
@@ -547,6 +549,8 @@ class LookLine(Record):
     seeds: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
     look: Positive | None = None
     pairs: list[DecidedPair] = []
+    seed: Count | None = None
+    curves: str | None = None
 
 
 class RoundLine(Record):

@@ -181,6 +181,12 @@ class MaxT:
         p: FloatArray = (1 + self.reached) / (1 + self.n_relabelings)[:, None]
         return p
 
+    def resume(self, row: int, p: float, count: int) -> None:
+        """Take over the p that `count` relabelings of a pair gave before, unless the relabelings here contradict it."""
+        if count > self.n_relabelings[row] and self.turns(np.full(len(self.t), p), 1e-6)[row]:
+            self.reached[row] = 0 if p < 1 / count else round(p * count)
+            self.n_relabelings[row] = count
+
     def critical(self, level: float) -> FloatArray:
         """Return, shape (P,), the |t| that a comparison of a ratio must exceed for an adjusted p of at most `level`.
 

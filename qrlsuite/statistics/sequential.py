@@ -12,8 +12,8 @@ added. By `steps`, relabelings of a look go on until no decision can turn.
 A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
 1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
 
-`decide` is a function of the design and the runs so far: nothing else is remembered between looks, so that an
-interrupted study goes on where it was.
+`decide` is a function of the design and the runs so far, so that an interrupted study goes on where it was. A p that
+took many relabelings at a look may be handed over, to be checked by 10,000 and not computed again.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
-from qrlsuite.statistics.permutation import Blocks, MaxT, relabelings_for, with_half_epoch
+from qrlsuite.statistics.permutation import CHUNK, Blocks, MaxT, relabelings_for, with_half_epoch
 from qrlsuite.statistics.steps import RISK, relabel
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
 from qrlsuite.statistics.times_board import log_ratios
@@ -40,6 +40,8 @@ RULES = ("times", "steps")
 """Rules that may judge the pairs of a design."""
 MOST_RELABELINGS = 200_000
 """At levels below 1e-4 a difference needs p = 1 / 200,001 or so; at levels below that there is none."""
+Known = Mapping[tuple[int, tuple[str, ...]], tuple[float, int]]
+"""By runs at a look and names of a pair: p of an earlier reading, and its relabelings."""
 _POINTS = 1001  # of the numerical integration
 _TAIL = 9.0  # standard deviations beyond which a density is nothing
 
@@ -289,6 +291,8 @@ class PairDecision:
         Runs of each at its last look, 0 before the first.
     p, levels:
         p and the level it was compared with last, at each look so far.
+    relabelings:
+        Relabelings behind each p by rule `steps`.
     difference:
         Mean time of the second over mean time of the first, minus 1, at the last look. After an early stop it is biased
         away from 0.
@@ -312,6 +316,7 @@ class PairDecision:
     n_runs: int = 0
     p: tuple[float, ...] = ()
     levels: tuple[float, ...] = ()
+    relabelings: tuple[int, ...] = ()
     difference: float = math.nan
     interval: tuple[float, float] = (-1.0, math.inf)
     within_margin: bool = False
@@ -383,7 +388,9 @@ class Decision:
         return not self.wanted
 
 
-def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: Grid) -> Decision:
+def decide(
+    design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: Grid, known: Known | None = None
+) -> Decision:
     """Return a design's decision from the runs so far.
 
     Parameters
@@ -396,6 +403,8 @@ def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: G
         count for later ones only; runs that come after all pairs of an entry are closed are not looked at.
     grid:
         Its E thresholds count; its deltas do not.
+    known:
+        By rule `steps`: p of an earlier reading of the same runs.
 
     Raises
     ------
@@ -418,7 +427,7 @@ def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: G
         wanted = wanted_at(pairs, n_runs)
         if any(name not in times or len(times[name]) < n_runs for name in wanted):
             return Decision(design, tuple(pairs), wanted)
-        [pairs] = next_look(design, look, [pairs], [times])
+        [pairs] = next_look(design, look, [pairs], [times], known or {})
     return Decision(design, tuple(pairs), {})
 
 
@@ -442,7 +451,7 @@ def next_look(
     look: int,
     studies: Sequence[Sequence[PairDecision]],
     times: Sequence[Mapping[str, IntArray]],
-    settled: bool = True,
+    known: Known | None = None,
 ) -> list[list[PairDecision]]:
     """Return the pairs of several studies of one design after look 0, 1, ...; closed pairs are unchanged.
 
@@ -454,8 +463,9 @@ def next_look(
         For each study the pairs as the look before left them.
     times:
         For each study the `judged_numbers` of its entries, (N, E) with N at least the look's runs.
-    settled:
-        Whether relabelings of rule `steps` go on until no decision can turn; simulations do without.
+    known:
+        As for `decide`. Relabelings of rule `steps` go on until no decision can turn; in simulations, without `known`,
+        they do not.
     """
     n_runs = design.looks[look]
     todo = [
@@ -471,7 +481,11 @@ def next_look(
         pair = studies[study][index]
         data.append((times[study][pair.first][:n_runs], times[study][pair.second][:n_runs]))
     test = MaxT(data, design.blocks[: look + 1], design.seed, ratio=design.rule == "steps")
-    if test.ratio and settled:
+    if test.ratio and known is not None:
+        test.extend(CHUNK)
+        for row, (study, index) in enumerate(todo):
+            pair = studies[study][index]
+            test.resume(row, *known.get((n_runs, (pair.first, pair.second)), (1.0, 0)))
         levels = {design.level(look, 1 + others) for others in range(len(design.family))}
         count = len(test.t)
         relabel(
@@ -490,7 +504,7 @@ def next_look(
         for index, row in of_study.items():
             if not test.ratio:
                 result[study][index] = _led(result[study][index], data[row], test.t[row])
-            elif settled:
+            elif known is not None:
                 result[study][index] = _relabeled(result[study][index], data[row], test, row)
         _close(design, look, result[study])
     return result
@@ -535,7 +549,8 @@ def _relabeled(pair: PairDecision, data: tuple[IntArray, IntArray], test: MaxT, 
     ratio, error, _ = _log_ratio(data)
     reach = float(test.critical(pair.levels[-1])[row]) * error if error else 0.0
     reach = min(reach, abs(ratio) * (1 - 1e-9)) if pair.differs else max(reach, abs(ratio))
-    return replace(pair, interval=(math.expm1(ratio - reach), math.expm1(ratio + reach)))
+    interval = (math.expm1(ratio - reach), math.expm1(ratio + reach))
+    return replace(pair, interval=interval, relabelings=(*pair.relabelings, int(test.n_relabelings[row])))
 
 
 def _log_ratio(data: Sequence[IntArray]) -> tuple[float, float, float]:

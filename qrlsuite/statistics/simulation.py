@@ -205,7 +205,7 @@ def play(design: SequentialDesign, drawn: Sequence[IntArray]) -> DecisionRates:
     times = [{name: each[k] for name, each in zip(design.entries, drawn)} for k in range(count)]
     studies = [list(begin(design)) for _ in range(count)]
     for look in range(len(design.looks)):
-        studies = next_look(design, look, studies, times, settled=False)
+        studies = next_look(design, look, studies, times)
     by_pair = list(zip(*studies))
     return DecisionRates(
         n_studies=count,

@@ -59,8 +59,8 @@ class TimesBoard:
         Shape (M, M): M of the row's entry over M of the column's, minus 1, half an epoch's steps added to both.
     difference_interval:
         Shape (M, M, 2): at the level at which Holm's procedure tested the pair; NaN where undecided.
-    turns:
-        Shape (M, M): whether more than 10 million relabelings could turn the decision.
+    p_error:
+        Shape (M, M): Monte Carlo error of the adjusted p where 10 million relabelings leave the decision open, else 0.
     ranks:
         Shape (M, 2): best and worst rank that the decisions leave; 0 for entries that stand apart.
     failed, spreads:
@@ -79,7 +79,7 @@ class TimesBoard:
     directions: tuple[tuple[Direction, ...], ...] = field(repr=False)
     difference: FloatArray = field(repr=False)
     difference_interval: FloatArray = field(repr=False)
-    turns: BoolArray = field(repr=False)
+    p_error: FloatArray = field(repr=False)
     ranks: IntArray = field(repr=False)
     failed: tuple[int, ...]
     spreads: tuple[float, ...]
@@ -162,16 +162,17 @@ def times_board(
     test = MaxT([(of_runs[i][:, None], of_runs[j][:, None]) for i, j in pairs], seed=seed, ratio=True)
     turning = settle(test, alpha)
     p, adjusted = (np.full((size, size), np.nan) for _ in range(2))
-    turns = np.zeros((size, size), dtype=bool)
+    p_error = np.zeros((size, size))
     means = np.array([each.mean() for each in of_runs])
     difference = means[:, None] / means - 1
     interval = np.full((size, size, 2), np.nan)
     directions = [[Direction.UNDECIDED] * size for _ in range(size)]
     corrected, levels = holm(test.p), holm_levels(test.p, alpha)
+    errors = turning * corrected * np.sqrt((1 - test.p) / test.p / test.n_relabelings)
     for index, (i, j) in enumerate(pairs):
         p[i, j] = p[j, i] = test.p[index]
         adjusted[i, j] = adjusted[j, i] = corrected[index]
-        turns[i, j] = turns[j, i] = turning[index]
+        p_error[i, j] = p_error[j, i] = errors[index]
         sign = int(np.sign(test.t[index, 0])) if corrected[index] <= alpha else 0
         directions[i][j], directions[j][i] = named_direction(sign), named_direction(-sign)
         _, low, high = ratio_interval(of_runs[i], of_runs[j], float(levels[index]), sign != 0, seed)
@@ -191,7 +192,7 @@ def times_board(
         directions=tuple(tuple(row) for row in directions),
         difference=difference,
         difference_interval=interval,
-        turns=turns,
+        p_error=p_error,
         ranks=rank_ranges(better, [place in ranked for place in range(size)]),
         failed=tuple(int((each == end).all(axis=1).sum()) for each in times),
         spreads=tuple(spread(each) for each in of_runs),

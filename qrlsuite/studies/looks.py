@@ -8,9 +8,9 @@ own, in a folder of its own:
                             looks.jsonl         times of the first seed and of each look, and the look's results
                             <task>/<entry>/...  as in any results folder; each seed's record has the study's hash
 
-Verdicts follow from the study and the curves alone. The log decides nothing: it has the time of each look, and reveals
-curves that were changed after it. Leaderboards do not read this folder: if the number of seeds depends on results, the
-p-value of a fixed number of seeds does not hold.
+Verdicts follow from the study and the curves. The log has the time of each look, and reveals curves that were changed
+after it. By rule `steps` it has p, too, which 10,000 relabelings check at every later reading. Leaderboards do not read
+this folder: if the number of seeds depends on results, the p-value of a fixed number of seeds does not hold.
 """
 
 from __future__ import annotations
@@ -286,8 +286,15 @@ class Study:
                 values = np.stack([done[seed][: self.epochs] for seed in seeds[name]])
                 steps = self.entries[name].task.file.protocol.interactions
                 curves[name] = LearningCurves(values, steps, name)
-        decision = decide(self.design, curves, self.grid)
-        self._compare(decision, log)
+        known = {
+            (line.look or 0, tuple(pair.pair)): (pair.p, pair.relabelings)
+            for line in log
+            if line.curves is not None and line.curves == _seen(line, curves)
+            for pair in line.pairs
+            if pair.p is not None and pair.relabelings
+        }
+        decision = decide(self.design, curves, self.grid, known)
+        self._compare(_lines(self.design, decision, curves), log)
         return State(
             self,
             begun,
@@ -300,17 +307,20 @@ class Study:
             decision=decision,
         )
 
-    def _compare(self, decision: Decision, log: Sequence[LookLine]) -> None:
-        """Refuse curves by which a look finds something else than the log says."""
-        for line in _lines(self.design, decision):
+    def _compare(self, lines: Sequence[LookLine], log: Sequence[LookLine]) -> None:
+        """Refuse curves that a look did not see, or by which it finds something else than the log says."""
+        for line in lines:
             for before in (before for before in log if before.look == line.look):
-                for now, then in zip(line.pairs, before.pairs):
-                    if now.decided != then.decided:
-                        raise StoreError(
-                            f"{self.folder / LOG}: the look at {line.look} seeds found '{then.decided}' for "
-                            f"{' and '.join(now.pair)}, and the curves there now give '{now.decided}': results "
-                            "were changed since; restore them"
-                        )
+                turned = [
+                    f"; it found '{then.decided}' for {' and '.join(now.pair)}, now it is '{now.decided}'"
+                    for now, then in zip(line.pairs, before.pairs)
+                    if now.decided != then.decided
+                ]
+                if turned or before.curves not in (None, line.curves):
+                    raise StoreError(
+                        f"{self.folder / LOG}: the look at {line.look} seeds saw other curves than are there now"
+                        f"{''.join(turned)}: results were changed since; restore them"
+                    )
 
     def _log(self) -> list[LookLine]:
         return read_records(self.folder / LOG, LookLine)
@@ -322,7 +332,7 @@ class Study:
         """Take every look for which the seeds are there, and note when."""
         state = self.read()
         taken = dict(state.taken)
-        for line in _lines(self.design, state.decision):
+        for line in _lines(self.design, state.decision, state.curves):
             if line.look is not None and line.look not in state.taken:
                 taken[line.look] = _now()
                 content = {"time": taken[line.look], "plan": self.hash, **line.content}
@@ -556,7 +566,9 @@ def _content(file: StudyFile) -> dict[str, Any]:
     return {"format_version": 1, "name": file.name, "task": task, **looks, "entries": entries}
 
 
-def _lines(design: SequentialDesign, decision: Decision) -> list[LookLine]:
+def _lines(
+    design: SequentialDesign, decision: Decision, curves: Mapping[str, LearningCurves]
+) -> list[LookLine]:
     """Return the results of each look: for every open pair, its p and how it was closed."""
     lines = []
     for index, look in enumerate(design.looks):
@@ -565,13 +577,22 @@ def _lines(design: SequentialDesign, decision: Decision) -> list[LookLine]:
                 pair=[pair.first, pair.second],
                 p=pair.p[index],
                 decided=None if pair.decided is None or index < len(pair.p) - 1 else str(pair.decided),
+                **({"relabelings": pair.relabelings[index]} if pair.relabelings else {}),
             )
             for pair in decision.pairs
             if index < len(pair.p)
         ]
         if pairs:
-            lines.append(LookLine(look=look, pairs=pairs))
+            line = LookLine(look=look, pairs=pairs)
+            seen = {"seed": design.seed, "curves": _seen(line, curves)} if design.rule == "steps" else {}
+            lines.append(line.changed(**seen))
     return lines
+
+
+def _seen(line: LookLine, curves: Mapping[str, LearningCurves]) -> str:
+    """Return the digest of the curves that a look sees, of those that are there."""
+    names = {name for pair in line.pairs for name in pair.pair if name in curves}
+    return digest({name: curves[name].values[: line.look].tolist() for name in names})
 
 
 def _names(entries: Sequence[Entry]) -> list[str]:

@@ -475,8 +475,36 @@ def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:
     for seed in range(10000, 10020):
         put(slow, seed, 20, STARTS["width=16"](seed))
     message = refused("show", "widths.toml")
-    assert "the look at 20 seeds found 'first needs fewer' for mlp width=16 and mlp width=4" in message
-    assert "now give 'None'" in message
+    assert (
+        "the look at 20 seeds saw other curves than are there now; it found 'first needs fewer' for "
+        in message
+    )
+    assert "mlp width=16 and mlp width=4, now it is 'None'" in message
+
+
+def test_a_look_stores_its_relabelings_and_a_later_reading_checks_them(refused: Refused) -> None:
+    """A stored p that 10,000 relabelings allow stands; a p that they contradict, and other curves, do not."""
+    run(write("mlp width=16", "mlp width=2"))
+    log = Path("runs/decisions/widths/looks.jsonl")
+    _, first, *_ = lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert (first["seed"], len(first["curves"])) == (0, 16)
+    [pair] = first["pairs"]
+    found = pair["p"]
+    assert pair["relabelings"] == 10_000
+    assert 0.1 < found < 0.9
+    for p, shown in ((found + 0.001, found + 0.001), (found / 3, found)):
+        pair |= {"p": round(p, 6), "relabelings": 1_000_000}
+        log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        assert answer("show", "widths.toml")["pairs"][0]["p"][0] == pytest.approx(shown, abs=1e-6)
+    store = EntryStore(next(Path("runs/decisions/widths/tiny").glob("*mlp*")))
+    put(store, 10000, 20, 1 + STARTS[store.record().label.split()[-1]](10000))
+    assert refused("show", "widths.toml").endswith(
+        "saw other curves than are there now: results were changed since; restore them\n"
+    )
+    for line in lines:
+        line.pop("curves", None)  # as in the log of an earlier version, which is read
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert answer("show", "widths.toml")["looks_taken"].keys() == {"20", "40", "60"}
 
 
 def test_every_record_of_a_seed_has_the_hash_of_its_study() -> None:

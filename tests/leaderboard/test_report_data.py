@@ -18,7 +18,7 @@ import qrlsuite
 from qrlsuite import api
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.boards.ranked import learning_curves
-from qrlsuite.leaderboard.report import encode, entries, ladder, render, sections, winners, words
+from qrlsuite.leaderboard.report import encode, entries, ladder, render, sections, winners
 from qrlsuite.leaderboard.report.judge import judge
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.options import parse_setting
@@ -62,10 +62,14 @@ def test_pairs_are_those_of_the_statistics() -> None:
 def test_a_page_agrees_with_its_board() -> None:
     board = boards.of([*boards.graded(6), boards.entry("few", 8)])
     (section,) = board.sections
-    beats, wins = judge(section).beats(), {row.entry.label: row.outperforms for row in section.tiers}
+    judged, wins = judge(section), {row.entry.label: row.outperforms for row in section.tiers}
     labels = [row.entry.label for row in section.rows]
     for place, label in enumerate(labels):
-        assert {labels[other] for other in np.flatnonzero(beats[place])} == set(wins[label])
+        pairs = {other: judged.pair(place, other) for other in range(len(labels)) if other != place}
+        beaten = {
+            labels[other] for other, pair in pairs.items() if pair.outcome(place) is Outcome.OUTPERFORMS
+        }
+        assert beaten == set(wins[label])
 
 
 def test_arcs_that_a_chain_stands_for_are_left_out() -> None:
@@ -139,10 +143,6 @@ def test_equal_labels_are_told_apart() -> None:
     twins = [boards.entry("same", 20), boards.entry("same", 21)]
     named = [boards.changed(twin, name=f"same-{i}") for i, twin in enumerate(twins, 1)]
     assert [view.label for view in entries.views(named)] == ["same (same-1)", "same (same-2)"]
-
-
-def test_numbers_in_words() -> None:
-    assert words.ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
 
 
 def test_a_task_has_one_row_in_who_wins_where_and_its_policies_are_named() -> None:

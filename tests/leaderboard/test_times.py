@@ -22,6 +22,7 @@ from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.boards.compared import compare_entries
+from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from tests.commands import say
@@ -93,11 +94,14 @@ def test_few_and_unequal_numbers_are_marked_and_below_20_nothing_is_decided() ->
 def test_a_pair_whose_decision_may_turn_is_named() -> None:
     made = times_of(reaching("early", (1, 60)), reaching("steady", (1, 30)))
     assert made.special() == made.as_dict()["within_monte_carlo_error"] == []
-    turns = ~np.eye(2, dtype=bool)
-    open_still = replace(made, board=replace(made.board, turns=turns))
+    facts = {"adjusted": np.full((2, 2), 0.05), "p_error": 2e-5 * ~np.eye(2, dtype=bool)}
+    open_still = replace(made, board=replace(made.board, **facts))
     assert open_still.special() == [
-        "within Monte Carlo error of its level after 10 million relabelings: steady and early"
+        "within Monte Carlo error of its level after 10 million relabelings: steady and early, "
+        "adjusted p = .05 +- 2e-05"
     ]
+    grid = made.rows[0].entry.task_file.ranking.grid
+    assert "adjusted p = .05 +- 2e-05" in pair_on(open_still, *made.rows, grid, ("a", "b")).sentence
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0, -0.1, float("nan")])
