@@ -124,7 +124,7 @@ def test_it_shows_what_a_study_trains(view: View, tiny_task: str, tmp_path: Path
     hold.wait(run)
     _, address = view()
     [group] = json.loads(answer(address, "/progress")[1])["groups"]
-    assert (group["entry"], group["seeds"]) == ("widths: tiny, ddqn mlp width=4 (2 running)", "10000-10001")
+    assert (group["entry"], group["seeds"]) == ("widths: tiny, ddqn mlp width=4 (2 running)", "10000:10002")
     [status] = json.loads(qrlsuite("runs", "--json", *runs).stdout)
     assert (status["study"], status["asked"], status["seeds"]) == ("widths", 2, {"running": 2})
     assert "widths: tiny  ddqn-mlp" in qrlsuite("runs", *runs).stdout
