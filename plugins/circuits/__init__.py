@@ -83,7 +83,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             products=True,
             max_qubits=MAX_QUBITS,
             speedup="36 to 181 times faster; --set device=qrlsuite.native is 4 to 8 times faster than default.qubit",
-            quick=(2, 2),
+            quick=(2, 1),
         )
     )
     register(
@@ -95,6 +95,6 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             products=True,
             max_qubits=MAX_QUBITS,
             speedup="45 to 173 times faster",
-            quick=(2, 2),
+            quick=(2, 1),
         )
     )
