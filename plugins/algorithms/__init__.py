@@ -52,6 +52,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.reinforce:REINFORCEOptions",
             factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
             unusable="qrlsuite.plugins.algorithms:unusable_reinforce",
+            numerics=2,
         )
     )
     register(

@@ -26,13 +26,14 @@ How it meets a fixed number of steps per epoch:
 Steps lie in slots, (memory + rounds) per environment, and every slot goes through the networks in every epoch, with
 weight 0 if it has no step to learn from. All sums thus run over shapes that do not depend on the lengths of episodes,
 so that each agent is bitwise the agent of a separate training. A model's count of circuit executions includes the
-empty slots, so `memory` should not be longer than episodes are.
+empty slots, so `memory` should not be longer than episodes are. Compiled networks without circuits see each agent's
+filled slots first, and only as many blocks as one of the agents fills: what is left out would add zeros.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -47,8 +48,11 @@ from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import Adam, by_seed, part, prefixed
+from qrlsuite.population import Adam, by_seed, part, prefixed, sweeps
 from qrlsuite.seeding import Streams
+
+if TYPE_CHECKING:
+    from qrlsuite.compiled.perceptron import Sweep
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -259,6 +263,13 @@ class Reinforce:
         columns = np.stack([weight, g - baseline]).astype(np.float32)
         w, advantage = torch.from_numpy(columns).to(self.device)  # (S, N) each, N = E x T
         every = rows.reshape(self.S, -1, self.seen_dim + 1)
+        if self._sweeps() is not None and not hasattr(self.policy, "executions"):
+            most = BLOCK * max(
+                1, -(-count.max() // BLOCK)
+            )  # whole blocks: sums are alike for any number of agents
+            filled = torch.from_numpy(np.argsort(~flat, axis=1, kind="stable")[:, :most])
+            w, advantage = w.gather(1, filled), advantage.gather(1, filled)
+            every = every.take_along_dim(filled[..., None], 1)
         self.adam.zero_grad()
         if self.value_adam is not None:
             self.value_adam.zero_grad()
@@ -292,6 +303,9 @@ class Reinforce:
         actions, weights, advantages:
             (S, B); weights are 1/n, or 0 in slots that are not learned from.
         """
+        whole = self._sweeps()
+        if whole is not None:
+            return self._add_slopes(whole, states, actions, weights, advantages)
         log_policy = torch.log_softmax(self._logits(states), -1).gather(2, actions[..., None]).squeeze(2)
         value_loss = torch.zeros(self.S, device=self.device)
         if self.value is not None:
@@ -301,6 +315,30 @@ class Reinforce:
         loss = -(weights * advantages * log_policy).sum(1)
         torch.autograd.backward((loss + value_loss).sum())
         return torch.stack([loss.detach(), value_loss.detach()]).to(torch.float64)
+
+    def _sweeps(self) -> list[Sweep] | None:
+        """Return the networks as compiled sweeps, which learn without autograd; None where one is none."""
+        networks = [self.policy] if self.value is None else [self.policy, self.value]
+        return sweeps(*networks) if self.device.type == "cpu" else None
+
+    def _add_slopes(
+        self, networks: Sequence[Sweep], states: Tensor, actions: Tensor, weights: Tensor, advantages: Tensor
+    ) -> Tensor:
+        """Do as `_accumulate` by the derivatives of its formulas."""
+        from qrlsuite.compiled.policies import judge_choices
+
+        x, value_loss = masks.observed(states, self.obs_dim).numpy(), torch.zeros(self.S)
+        if self.value is not None:
+            values, records = networks[1].values(x, True)
+            error = torch.from_numpy(values).squeeze(2) - advantages
+            networks[1].add_gradients(records, (2.0 * weights * error)[..., None].numpy())
+            value_loss, advantages = (weights * error.square()).sum(1), -error
+        outputs, records = networks[0].values(x, True)
+        free = masks.masked(torch.from_numpy(outputs), states, self.obs_dim).numpy()
+        log_policy, _, pull = judge_choices(free, [self.n_actions], actions[..., None].numpy())
+        slopes = -(weights * advantages)
+        networks[0].add_gradients(records, pull(slopes.numpy(), 0.0))
+        return torch.stack([(slopes * torch.from_numpy(log_policy)).sum(1), value_loss]).to(torch.float64)
 
     def _carry(self, rows: Tensor, steps: NDArray[np.int64], known: BoolArray) -> None:
         """Keep the last steps of unfinished episodes: the steps after the last end among the last `steps` slots."""

@@ -124,6 +124,16 @@ class Sweep(ABC):
         for tensor, part in zip(self.tensors, self._kept_parts):
             tensor.grad = part if tensor.requires_grad else None
 
+    def add_gradients(self, records: Any, cotangents: Array) -> None:
+        """Like `set_gradients`, but add to gradients that are there, as autograd does."""
+        trained = [(each, part) for each, part in zip(self.tensors, self._kept_parts) if each.requires_grad]
+        if self.kept_gradients is None or any(each.grad is not part for each, part in trained):
+            self.set_gradients(records, cotangents)
+        else:
+            more = np.empty_like(self.parameters)
+            self.pull(records, cotangents, more, None)
+            self.kept_gradients += more
+
     def gradients_of(self, parameters: Sequence[Tensor]) -> Array | None:
         """Return all parameters' gradients, if the arguments are these parameters with gradients of `set_gradients`."""
         if len(parameters) != len(self._kept_parts):

@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.plugins.algorithms import reinforce
 from qrlsuite.plugins.algorithms.reinforce import Reinforce, rewards_to_go
+from qrlsuite.testing.group import Toy
 from tests.algorithms.worlds import Clock, Contexts, Group, Perceptron, log_softmax
 
 
@@ -64,6 +67,39 @@ def test_first_update_is_that_of_an_independent_computation(
         assert metrics["learned_steps"][s] == n
         d = -advantage[:, None] * (np.eye(3)[a] - np.exp(logs)) / n
         policies[s].assert_updated(made.policy, d, lr, s)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    baseline=st.sampled_from(["none", "mean", "value"]),
+    masked=st.booleans(),
+    share=st.sampled_from([0.05, 0.3, 1.0]),
+    draw=st.integers(0, 100),
+)
+def test_gradients_without_autograd_are_those_of_autograd(
+    baseline: str, masked: bool, share: float, draw: int
+) -> None:
+    def made() -> Reinforce:
+        learner: Reinforce = (
+            Group("reinforce", [0, 1], Toy(4, masked=masked), baseline=baseline).start().algorithm
+        )
+        return learner
+
+    compiled, plain = made(), made()
+    plain.policy.register_forward_hook(lambda *given: None)  # which a compiled pass would not call
+    assert (compiled._sweeps() is None, plain._sweeps() is None) == (False, True)
+    rows = compiled._collect(300)[0][..., :-1]  # with the slots of `memory`, empty
+    generator = np.random.default_rng(draw)
+    learned = generator.random(rows.shape[:3]) < share
+    learned[:, :, :500] = False
+    returns = generator.normal(size=learned.shape)
+    measured = [learner._learn(rows, returns, learned) for learner in (compiled, plain)]
+    for name, values in measured[0].items():
+        np.testing.assert_allclose(values, measured[1][name], rtol=1e-3, atol=1e-6, err_msg=name)
+    for network in ("policy", "value"):
+        ours, theirs = (getattr(learner, network) for learner in (compiled, plain))
+        for own, other in zip(ours.parameters(), theirs.parameters()) if ours is not None else ():
+            torch.testing.assert_close(own.grad, other.grad, rtol=1e-3, atol=1e-6)
 
 
 def clock(lengths: list[int], seeds: int = 1, cut: bool = False, **settings: Any) -> Reinforce:

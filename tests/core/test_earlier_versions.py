@@ -35,6 +35,7 @@ compared number by number, everything else byte by byte."""
 CHANGES = {
     "mlp": ("v0.2.0", "model 'mlp' has numerics 2, and had 1"),
     "ppo": ("v0.2.1", "algorithm 'ppo' has numerics 2, and had 1"),
+    "reinforce": ("v0.2.1", "algorithm 'reinforce' has numerics 2, and had 1"),
 }
 """By part, the version since which its bits are others: layers of networks are compiled sweeps, and those learn without
 autograd. Seeds that earlier versions began are another entry. Networks trained anew are compared number by number;
