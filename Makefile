@@ -64,13 +64,12 @@ docs: install-dev
 	QRLSUITE_DOCS_PACKAGE=$(VENV)/wheel NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Executes docs/tutorials in a kernel, each in a folder of its own, and stores them with their output, without timings;
-# what a tutorial trains and installs is left in a folder of the virtual environment.
+# what a tutorial trains is left in a folder of the virtual environment.
 tutorials: install-dev
 	rm -rf $(VENV)/tutorials
 	mkdir -p $(VENV)/tutorials
 	cp docs/tutorials/*.ipynb $(VENV)/tutorials
-	cd $(VENV)/tutorials && PYTHONPATH=$(abspath $(VENV))/tutorials/site PIP_TARGET=$(abspath $(VENV))/tutorials/site \
-	  PIP_NO_BUILD_ISOLATION=0 PIP_NO_DEPS=1 $(abspath $(BIN))/python -c "import glob, nbclient, nbformat, os; \
+	cd $(VENV)/tutorials && $(abspath $(BIN))/python -c "import glob, nbclient, nbformat, os; \
 	  [nbformat.write(nbclient.execute(nbformat.read(path, 4), cwd=(os.mkdir(path + '.runs') or path + '.runs'), \
 	  record_timing=False, coalesce_streams=True), path) for path in sorted(glob.glob('*.ipynb'))]"
 	cp $(VENV)/tutorials/*.ipynb docs/tutorials

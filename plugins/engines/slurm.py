@@ -195,9 +195,10 @@ class SlurmEngine:
         _remember(work.store, ids, work.groups, work.epochs)
         array = ids[0].partition("_")[0]
         plural = "s" * (len(ids) > 1)
+        stops = "stops them" if work.script else "stops them with everything saved"
         return EngineOutcome(
             submitted=f"submitted {len(ids)} task{plural} as SLURM job {array}; `qrlsuite runs` shows how far they "
-            f"are, `scancel {array}` stops them with everything saved, the same command submits what is missing then"
+            f"are, `scancel {array}` {stops}, the same command submits what is missing then"
         )
 
 

@@ -33,7 +33,7 @@ from qrlsuite.experiment import script as scripts
 from qrlsuite.experiment.entry import Entry, of_script
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.experiment.script import SCRIPT
-from qrlsuite.experiment.task import Task
+from qrlsuite.experiment.task import EXTERNAL, Task
 from qrlsuite.results import codes, points, provenance
 from qrlsuite.results.points import Points
 from qrlsuite.results.progress import Progress, most_memory
@@ -195,9 +195,11 @@ class _Run:
     def _require_begun(self, found: Points) -> None:
         every = self.file.protocol.interactions
         if found.steps[0] > every:
+            new = self.entry.task.environment.name == EXTERNAL
+            cure = f"say every={found.steps[0]}" if new else "give a task with longer epochs"
             raise QrlSuiteError(
                 f"{self.name}: its first score is at step {found.steps[0]}, after the first epoch of {every} steps: "
-                "scores are not carried backward; give a task with longer epochs"
+                f"scores are not carried backward; {cure}"
             )
 
     def _scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,7 +19,8 @@ from qrlsuite import specs
 from qrlsuite.actions import check_actions, size
 from qrlsuite.testing.common import Subject, check_cases
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
-from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, World, array, differs
+from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, World, array
+from qrlsuite.testing.lanes import differs
 
 S = 5
 

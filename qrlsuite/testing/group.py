@@ -343,10 +343,3 @@ class ToyGroup:
 def array(value: Any) -> NDArray[Any]:
     """Copy an algorithm's result of any type."""
     return np.array(value.detach().numpy() if isinstance(value, Tensor) else value)
-
-
-def differs(a: Saved, b: Saved) -> str | None:
-    """Return the names that only one of them has, or the first that is not the same in both, or None."""
-    if a.keys() != b.keys():
-        return ", ".join(sorted(a.keys() ^ b.keys()))
-    return next((k for k, v in a.items() if not np.array_equal(v, b[k], equal_nan=v.dtype.kind == "f")), None)

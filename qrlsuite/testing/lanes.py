@@ -99,13 +99,11 @@ def _scores(infos: Mapping[str, Any], lanes: int) -> NDArray[np.float64]:
     return np.where(infos["_final_obs"], score, np.nan)
 
 
-def differs(a: Seen, b: Seen) -> str | None:
-    """Return the name of the first that is not the same in both, or None."""
-    return next((name for name, value in a.items() if not _same(value, b[name])), None)
-
-
-def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+def differs(a: Mapping[str, NDArray[Any]], b: Mapping[str, NDArray[Any]]) -> str | None:
+    """Return the names that only one of them has, or the first that is not the same in both, or None."""
+    if a.keys() != b.keys():
+        return ", ".join(sorted(a.keys() ^ b.keys()))
+    return next((k for k, v in a.items() if not np.array_equal(v, b[k], equal_nan=v.dtype.kind == "f")), None)
 
 
 def first_episodes(seen: Seen) -> list[Seen]:

@@ -21,9 +21,9 @@ def same_seed(lanes: Lanes, steps: int) -> None:
     first = lanes.make([0, 1])
     action_rows = actions([0, 1], first.single_action_space, steps)
     play(first, action_rows)
-    first.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
     again = lanes.make([0, 1])
-    again.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
+    for envs in (first, again):
+        envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
     name = differs(play(first, action_rows), play(again, action_rows))
     require(name is None, f"a used environment, reset, shows other {name} than a new one: {STREAMS}")
 

@@ -69,19 +69,9 @@ def run(
     """Run a tutorial's cells one after the other; returns the outputs of each."""
     from IPython.utils.capture import capture_output
 
-    site, folder = tmp_path / "site", tmp_path / "folder"
-    site.mkdir()
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    monkeypatch.syspath_prepend(site)
-    monkeypatch.setenv("PYTHONPATH", str(site))
-    for option, value in {"TARGET": site, "NO_BUILD_ISOLATION": 0, "NO_DEPS": 1, "NO_INDEX": 1}.items():
-        monkeypatch.setenv(f"PIP_{option}", str(value))  # of `%pip install`
+    monkeypatch.chdir(tmp_path)
 
     def run(name: str) -> list[Outputs]:
-        if name == "own-circuit":
-            monkeypatch.setenv(registry.LOAD_PLUGINS, "crx-ring")
-            registry.load.cache_clear()
         found = []
         for cell in cells(name):
             small = f"{SIZES}; task = {tiny_task!r}"

@@ -164,8 +164,8 @@ BACKENDS = [
     ("backends", NoEntangler,
      r"'theirs' cannot run it: OptionError: this device has no CZ; write a gate that it lacks as others"),
     ("backends", Damped,
-     r"values of backend 'theirs' differ by 0\.\d+ from dense .* `qrlsuite check circuit-backend:theirs`"),
-    ("gradients", HalfGradient,
+     r"'theirs': values differ by 0\.\d+ from dense .* `qrlsuite check circuit-backend:theirs`"),
+    ("backends", HalfGradient,
      r"'theirs': the derivative by inputs is .*, finite differences .*fault is the backend's"),
 ]  # fmt: skip
 

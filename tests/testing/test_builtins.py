@@ -21,7 +21,7 @@ COMMON = ["name", "references", "lazy imports", "spawn"]
 OPTIONS = ["options documented", "options"]
 RULES = {
     "ansatzes": [
-        "builds", "pure", "inputs used", "parameters used", "layers", "effects", "backends", "gradients",
+        "builds", "pure", "inputs used", "parameters used", "layers", "effects", "backends",
     ],
     "circuit_backends": ["builds", "shapes", "values", "gradients", "repeatable", "seed independence"],
     "models": [
