@@ -314,7 +314,7 @@ def test_code_for_arm_has_vectors_and_fused_multiplications() -> None:
     from qrlsuite.plugins.circuits.native.sweeps import rotate
 
     def sweep(state: object, gates: object) -> None:
-        rotate(state, 3, 0, 1, gates, 0, 0, 0)
+        rotate(state, 3, 0, 1, gates, 0, 0, 0, 0)
 
     signature = (numba.types.Array(numba.float32, 2, "C"),) * 2
     options = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False, "no_cpython_wrapper": True}

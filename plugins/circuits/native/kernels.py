@@ -29,6 +29,7 @@ from qrlsuite.plugins.circuits.native.program import (
 from qrlsuite.plugins.circuits.native.sweeps import (
     HALF_ROOT,
     flip,
+    grow,
     hadamard,
     permute,
     rotate,
@@ -77,19 +78,6 @@ def fill_inputs(inputs: Any, seed: int, first: int, lanes: Any) -> None:
 
 
 @inlined
-def _angle(t: Any, index: int, flat: Any, seed: int, lanes: Any) -> Any:
-    """Return constant + scale * input + weight of an angle."""
-    value = splat(lanes, t.constants[index])
-    which, scale, weight = t.angles[index, 0], t.angles[index, 1], t.angles[index, 2]
-    if which >= 0:
-        x = load(lanes, which)
-        value = value + (splat(lanes, flat[seed, scale]) * x if scale >= 0 else x)
-    if weight >= 0:
-        value = value + splat(lanes, flat[seed, weight])
-    return value
-
-
-@inlined
 def split(t: Any, record: Any) -> Any:
     """Return a chunk's state, sines and cosines, and blocks: views of its record."""
     first = record.shape[0] - 6 * (t.blocks.shape[0] - 1)
@@ -99,13 +87,23 @@ def split(t: Any, record: Any) -> Any:
 
 @inlined
 def prepare(t: Any, flat: Any, seed: int, inputs: Any, trig: Any, gates: Any) -> None:
-    """Fill in sine and cosine of every rotation's half angle, and (a, b) and the phase of every block."""
+    """Fill in sine and cosine of every rotation's half angle, and (a, b) and the phase of every block.
+
+    An angle is constant + scale * input + weight. Its lines stand in the loop, and are no function of `t`: at each call
+    numba counts its arrays' references, which takes longer than a sine.
+    """
     one, zero = splat(inputs, 1.0), splat(inputs, 0.0)
     for g in range(t.blocks.shape[0] - 1):
         ar, ai, br, bi, cr, ci = one, zero, zero, zero, one, zero
         for r in range(t.blocks[g], t.blocks[g + 1]):
-            axis = t.rotations[r, 0]
-            angle = _angle(t, t.rotations[r, 1], flat, seed, inputs)
+            axis, index = t.rotations[r, 0], t.rotations[r, 1]
+            which, scale, weight = t.angles[index, 0], t.angles[index, 1], t.angles[index, 2]
+            angle = splat(inputs, t.constants[index])
+            if which >= 0:
+                x = load(inputs, which)
+                angle = angle + (splat(inputs, flat[seed, scale]) * x if scale >= 0 else x)
+            if weight >= 0:
+                angle = angle + splat(inputs, flat[seed, weight])
             half = 1.0 if axis == PHASE else 0.5
             s, c = sine_cosine(angle * splat(inputs, half * t.factors[r]))
             store(trig, 2 * r, s)
@@ -135,42 +133,44 @@ def _component(t: Any, c: int, states: Any) -> Any:
 
 @inlined
 def _begin(t: Any, c: int, state: Any) -> None:
-    """Put a component's state into |0...0> with the opening Hadamards applied, and the factors of joined ones."""
-    zero = splat(state, 0.0)
+    """Write the first amplitude of |0...0> with the opening Hadamards applied, and the factors of joined ones."""
     opening, weight = t.components[c, 5], 1.0
     for q in range(t.components[c, 0]):
         if opening & (1 << q):
             weight *= HALF_ROOT
     for _ in range(t.components[c, 6]):
         weight *= HALF_ROOT
-    amplitude = splat(state, weight)
-    for i in range(1 << t.components[c, 0]):
-        store(state, 2 * i, zero if i & ~opening else amplitude)
-        store(state, 2 * i + 1, zero)
+    store(state, 0, splat(state, weight))
+    store(state, 1, splat(state, 0.0))
 
 
 @inlined
-def _take(t: Any, component: int, n: int, state: Any, gates: Any) -> None:
-    """Take every step of a component."""
+def _take(t: Any, component: int, n: int, state: Any, gates: Any, low: int) -> None:
+    """Take every step of a component, whose state has grown to the bits from `low` on: all if it is 0, else none."""
+    opening = t.components[component, 5]
     for m in range(t.components[component, 3], t.components[component, 4]):
         kind, a, b, c, d = t.steps[m, 0], t.steps[m, 1], t.steps[m, 2], t.steps[m, 3], t.steps[m, 4]
+        bit = 0 if kind != ROTATE else b if a < 0 else min(a, b)
+        grow(state, n, low, bit, opening)
+        low = min(low, bit)
         if kind == ROTATE:
-            rotate(state, n, a, b, gates, c, d, t.steps[m, 5])
+            rotate(state, n, a, b, gates, c, d, t.steps[m, 5], low)
         elif kind == HADAMARD:
             hadamard(state, n, a, b, c)
         elif kind == PERMUTE:
             permute(state, t.cycles, a, b)
         else:
             flip(state, t.negative, a, b)
+    grow(state, n, low, 0, opening)
 
 
 @inlined
-def _run(t: Any, states: Any, gates: Any) -> None:
+def run(t: Any, states: Any, gates: Any) -> None:
     """Bring every component into its final state."""
     for component in range(t.components.shape[0]):
         n, state = _component(t, component, states)
         _begin(t, component, state)
-        _take(t, component, n, state, gates)
+        _take(t, component, n, state, gates, n)
 
 
 @inlined
@@ -184,30 +184,30 @@ def _odd(state: int) -> int:
 
 
 @inlined
-def _measure(t: Any, states: Any, w: Any) -> None:
+def measure(t: Any, states: Any, values: Any, results: Any) -> None:
     """Write <Z> of every bit to `results`: fold the probabilities, highest bit first. Products come before, in sums."""
-    products = w.results.shape[0] - t.products.shape[0]
+    products = results.shape[0] - t.products.shape[0]
     for c in range(t.components.shape[0]):
         qubits, state = _component(t, c, states)
         size = 1 << qubits
         for i in range(size):
             re, im = load(state, 2 * i), load(state, 2 * i + 1)
-            store(w.values, i, re * re + im * im)
+            store(values, i, re * re + im * im)
         for p in range(t.products.shape[0]):
             if t.products[p, 0] == c:
-                mean = splat(w.values, 0.0)
+                mean = splat(values, 0.0)
                 for i in range(size):
-                    x = load(w.values, i)
+                    x = load(values, i)
                     mean = mean - x if _odd(i & t.products[p, 1]) else mean + x
-                store(w.results, products + p, mean)
+                store(results, products + p, mean)
         for bit in range(qubits - 1, -1, -1):
             size >>= 1
-            difference = splat(w.values, 0.0)
+            difference = splat(values, 0.0)
             for i in range(size):
-                x, y = load(w.values, i), load(w.values, i + size)
+                x, y = load(values, i), load(values, i + size)
                 difference += x - y
-                store(w.values, i, x + y)
-            store(w.results, t.components[c, 2] + bit, difference)
+                store(values, i, x + y)
+            store(results, t.components[c, 2] + bit, difference)
 
 
 @kernel
@@ -225,42 +225,37 @@ def forward(t: Any, inputs: Any, flat: Any, records: Any, keep: int, w: Any, out
             states, trig, gates = split(t, records[seed * chunks + chunk if keep else 0])
             fill_inputs(inputs, seed, first, w.inputs)
             prepare(t, flat, seed, w.inputs, trig, gates)
-            _run(t, states, gates)
-            _measure(t, states, w)
+            run(t, states, gates)
+            measure(t, states, w.values, w.results)
             for v in range(min(lanes, inputs.shape[1] - first)):
                 for o in range(t.observables.shape[0]):
                     out[seed, first + v, o] = w.results[t.observables[o], v]
 
 
 @inlined
-def _weigh(t: Any, cotangent: Any, seed: int, first: int, final: Any, psi: Any, lam: Any, w: Any) -> None:
-    """Copy the final state to psi and write lambda = (sum_o g_o Z_o) psi.
+def weigh(t: Any, final: Any, psi: Any, lam: Any, values: Any, results: Any) -> None:
+    """Copy the final state to psi and write lambda = (sum_o g_o Z_o) psi; `results` hold g of every bit and product.
 
     The diagonal of a component is built by doubling, highest bit first.
     """
-    zero = splat(w.values, 0.0)
-    for q in range(w.results.shape[0]):
-        store(w.results, q, zero)
-    for o in range(t.observables.shape[0]):
-        for v in range(min(w.results.shape[1], cotangent.shape[1] - first)):
-            w.results[t.observables[o], v] = cotangent[seed, first + v, o]
+    zero = splat(values, 0.0)
     for c in range(t.components.shape[0]):
         qubits, start = t.components[c, 0], t.components[c, 1]
-        store(w.values, 0, zero)
+        store(values, 0, zero)
         for bit in range(qubits - 1, -1, -1):
-            g = load(w.results, t.components[c, 2] + bit)
+            g = load(results, t.components[c, 2] + bit)
             for i in range((1 << (qubits - 1 - bit)) - 1, -1, -1):
-                f = load(w.values, i)
-                store(w.values, 2 * i, f + g)
-                store(w.values, 2 * i + 1, f - g)
+                f = load(values, i)
+                store(values, 2 * i, f + g)
+                store(values, 2 * i + 1, f - g)
         for p in range(t.products.shape[0]):
             if t.products[p, 0] == c:
-                g = load(w.results, w.results.shape[0] - t.products.shape[0] + p)
+                g = load(results, results.shape[0] - t.products.shape[0] + p)
                 for i in range(1 << qubits):
-                    f = load(w.values, i)
-                    store(w.values, i, f - g if _odd(i & t.products[p, 1]) else f + g)
+                    f = load(values, i)
+                    store(values, i, f - g if _odd(i & t.products[p, 1]) else f + g)
         for i in range(1 << qubits):
-            f = load(w.values, i)
+            f = load(values, i)
             j = 2 * (start + i)
             re, im = load(final, j), load(final, j + 1)
             store(psi, j, re)
@@ -315,7 +310,7 @@ def chain(
 
 
 @inlined
-def _unrun(
+def unrun(
     t: Any,
     psis: Any,
     lams: Any,
@@ -385,11 +380,16 @@ def backward(
             fill_inputs(inputs, seed, first, w.inputs)
             if not kept:
                 prepare(t, flat, seed, w.inputs, trig, gates)
-                _run(t, states, gates)
-            _weigh(t, cotangent, seed, first, states, psi, lam, w)
+                run(t, states, gates)
+            for q in range(w.results.shape[0]):
+                store(w.results, q, zero)
+            for o in range(t.observables.shape[0]):
+                for v in range(min(lanes, inputs.shape[1] - first)):
+                    w.results[t.observables[o], v] = cotangent[seed, first + v, o]
+            weigh(t, states, psi, lam, w.values, w.results)
             for i in range(slopes.shape[0]):
                 store(slopes, i, zero)
-            _unrun(t, psi, lam, gates, trig, w.inputs, overlap, flat, seed, sums, slopes)
+            unrun(t, psi, lam, gates, trig, w.inputs, overlap, flat, seed, sums, slopes)
             for v in range(min(lanes, inputs.shape[1] - first)):
                 for i in range(slopes.shape[0]):
                     grad_inputs[seed, first + v, i] = slopes[i, v]
@@ -418,7 +418,7 @@ def advance(t: Any, angles: Any, records: Any, first: int, fresh: int, inputs: A
         n, state = _component(t, 0, records[chunk])
         if fresh:
             _begin(t, 0, state)
-        _take(t, 0, n, state, gates)
+        _take(t, 0, n, state, gates, n if fresh else 0)
 
 
 @kernel
@@ -445,7 +445,7 @@ def retreat(
         fill_inputs(angles, 0, chunk * lanes, inputs)
         for a in range(slopes.shape[0]):
             store(slopes, a, zero)
-        _unrun(t, psis[chunk], lams[chunk], gates, trig, inputs, overlap, angles[0], 0, slopes[:0], slopes)
+        unrun(t, psis[chunk], lams[chunk], gates, trig, inputs, overlap, angles[0], 0, slopes[:0], slopes)
         for v in range(min(lanes, gradient.shape[0] - chunk * lanes)):
             for a in range(slopes.shape[0]):
                 gradient[chunk * lanes + v, a] += slopes[a, v]

@@ -39,11 +39,21 @@ def spread(k: int, bit: int) -> int:
 
 
 @inlined
-def pair(k: int, control: int, target: int) -> int:
-    """Return the k-th basis state whose target bit is 0 and whose control bit, if there is one, is 1."""
+def masks(control: int, target: int, low: int) -> tuple[int, int, int]:
+    """Return how `following` visits the pairs of a block: the first row, its fixed bits, and rows between a pair.
+
+    Of a state that has not grown to bits below `low` yet, these are fixed at 0, see `grow`.
+    """
+    step, rest = 2 << target, (2 << low) - 1
     if control < 0:
-        return spread(k, target)
-    return spread(spread(k, min(control, target)), max(control, target)) | (1 << control)
+        return 0, step | rest, step
+    return 2 << control, step | (2 << control) | rest, step
+
+
+@inlined
+def following(i: int, first: int, fixed: int) -> int:
+    """Return the row of the next pair: the next number on the bits that are not fixed."""
+    return (((i | fixed) + 1) & ~fixed) | first
 
 
 @inlined
@@ -102,30 +112,62 @@ def write_pair(state: Any, i: int, j: int, p0r: Any, p0i: Any, p1r: Any, p1i: An
 
 
 @inlined
+def grow(state: Any, qubits: int, low: int, bit: int, opening: int) -> None:
+    """Let a state that has no amplitudes yet where bits below `low` are 1 grow to those from `bit` on.
+
+    As long as no gate touches such a bit, amplitudes are the same where it is 1, if it begins with a Hadamard
+    (`opening`), else 0.
+    """
+    while low > bit:
+        low -= 1
+        away, opened = 2 << low, (opening >> low) & 1
+        for i in range(0, 2 << qubits, 2 * away):
+            re, im = load(state, i), load(state, i + 1)
+            store(state, i + away, re if opened else splat(state, 0.0))
+            store(state, i + away + 1, im if opened else splat(state, 0.0))
+
+
+@inlined
 def rotate(
-    state: Any, qubits: int, control: int, target: int, gates: Any, block: int, phase: int, behind: int
+    state: Any,
+    qubits: int,
+    control: int,
+    target: int,
+    gates: Any,
+    block: int,
+    phase: int,
+    behind: int,
+    low: int,
 ) -> None:
-    """Apply a block, and the Hadamards behind it."""
+    """Apply a block, and the Hadamards behind it, to a state that has grown to the bits from `low` on."""
     # Constants in the place of variables: each case becomes a loop of its own, without branches.
     if phase:
-        _rotate(state, qubits, control, target, gates, block, 1, behind)
+        _rotate(state, qubits, control, target, gates, block, 1, behind, low)
     elif behind == 0:
-        _rotate(state, qubits, control, target, gates, block, 0, 0)
+        _rotate(state, qubits, control, target, gates, block, 0, 0, low)
     elif behind == ON_CONTROL:
-        _rotate(state, qubits, control, target, gates, block, 0, ON_CONTROL)
+        _rotate(state, qubits, control, target, gates, block, 0, ON_CONTROL, low)
     else:
-        _rotate(state, qubits, control, target, gates, block, 0, behind)
+        _rotate(state, qubits, control, target, gates, block, 0, behind, low)
 
 
 @inlined
 def _rotate(
-    state: Any, qubits: int, control: int, target: int, gates: Any, block: int, phase: int, behind: int
+    state: Any,
+    qubits: int,
+    control: int,
+    target: int,
+    gates: Any,
+    block: int,
+    phase: int,
+    behind: int,
+    low: int,
 ) -> None:
     ar, ai, br, bi = read_block(gates, block)
     cr, ci = load(gates, 6 * block + 4), load(gates, 6 * block + 5)
-    step = 2 << target
-    for k in range(pairs(qubits, control)):
-        i = 2 * pair(k, control, target)
+    first, fixed, step = masks(control, target, low)
+    i = first
+    for _ in range(pairs(qubits - low, control)):
         j = i + step
         p0r, p0i, p1r, p1i = read_pair(state, i, j)
         p0r, p0i, p1r, p1i = rotated(p0r, p0i, p1r, p1i, ar, ai, br, bi)
@@ -143,6 +185,7 @@ def _rotate(
                 q1r, q1i, p1r, p1i = butterfly(q1r, q1i, p1r, p1i)
             write_pair(state, i - away, j - away, q0r, q0i, q1r, q1i)
         write_pair(state, i, j, p0r, p0i, p1r, p1i)
+        i = following(i, first, fixed)
 
 
 @inlined
@@ -189,9 +232,9 @@ def _unrotate(
     cr, ci = load(gates, 6 * block + 4), splat(gates, 0.0) - load(gates, 6 * block + 5)
     tx = splat(gates, 0.0)
     ty, tz, t1 = tx, tx, tx
-    step = 2 << target
-    for k in range(pairs(qubits, control)):
-        i = 2 * pair(k, control, target)
+    first, fixed, step = masks(control, target, 0)
+    i = first
+    for _ in range(pairs(qubits, control)):
         j = i + step
         p0r, p0i, p1r, p1i = read_pair(psi, i, j)
         l0r, l0i, l1r, l1i = read_pair(lam, i, j)
@@ -224,6 +267,7 @@ def _unrotate(
         l0r, l0i, l1r, l1i = rotated(l0r, l0i, l1r, l1i, ar, ai, br, bi)
         write_pair(psi, i, j, p0r, p0i, p1r, p1i)
         write_pair(lam, i, j, l0r, l0i, l1r, l1i)
+        i = following(i, first, fixed)
     store(overlap, 0, splat(gates, weight) * tx)
     store(overlap, 1, splat(gates, weight) * ty)
     store(overlap, 2, splat(gates, weight) * tz)
