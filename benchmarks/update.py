@@ -6,8 +6,9 @@
 An update is what training repeats: two forward passes for the target, one forward and backward pass, one step of
 Adam. Milliseconds of processor time per update and seed, medians, one thread, one run; ratios are to PennyLane at the
 same number of seeds. Qiskit is measured up to 6 qubits.
-For the native backend one round of training (choose actions, step the environment, update) is also divided: what
-part is the circuit's kernels, the environment, and the rest, which is torch.
+Of the native backend, milliseconds of a round of training (choose actions, step the environment, update) and of a
+pass of validation (100 episodes a seed) are printed, too, and what part of the round is the network's kernel, the
+environment, and the rest, which is Python. 200 of each are an epoch.
 
 `--controls` prints the table of docs/controls.md instead: of the circuits of these sizes, of every control and of
 networks of equal size the numbers of trained and of fixed parameters, the rank of the circuit's Jacobian, and the
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import time
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +27,7 @@ from typing import Any
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import numpy as np
 import torch
 from circuits import Call, median_ms
 
@@ -39,7 +42,7 @@ BATCH = 64
 
 
 def training(model: str, settings: list[str], seeds: int) -> tuple[Any, torch.Tensor]:
-    """Return a population's DDQN on the standard task, its replay buffer filled, and a batch's positions in it."""
+    """Return a population's DDQN on the standard task, its replay buffer filled, and a batch's draws from it."""
     settings_text = [*settings, f"algorithm.batch={BATCH}"]
     entry = resolve("beam6g", model, settings=[parse_setting(word) for word in settings_text])
     streams = [Streams(entry.task.hash, seed) for seed in parse_seeds(f"0:{seeds}")]
@@ -52,7 +55,7 @@ def training(model: str, settings: list[str], seeds: int) -> tuple[Any, torch.Te
     ddqn.start()
     for _ in range(7):  # fills the replay buffer without learning
         ddqn._interact(torch.zeros((seeds, 10), dtype=torch.int64))
-    return ddqn, torch.randint(70, (seeds, BATCH), generator=torch.Generator().manual_seed(0))
+    return ddqn, torch.rand((seeds, BATCH), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 
 def update(model: str, settings: list[str], seeds: int) -> Call:
@@ -61,12 +64,12 @@ def update(model: str, settings: list[str], seeds: int) -> Call:
     return lambda: ddqn._learn(picked)
 
 
-def parts(qubits: int, seeds: int, seconds: float) -> dict[str, float]:
-    """Return what part of a round of training is circuit, environment and torch."""
-    from qrlsuite.plugins.circuits.native import kernels
+def parts(qubits: int, seeds: int, seconds: float) -> tuple[float, dict[str, float]]:
+    """Return the milliseconds of a round of training, and what part is the network, the environment and Python."""
+    from qrlsuite.plugins.circuits.native import hybrid
 
     ddqn, picked = training("vqc-native", [f"qubits={qubits}"], seeds)
-    spent = dict.fromkeys(("circuit", "environment"), 0.0)
+    spent = dict.fromkeys(("network", "environment"), 0.0)
 
     def timed(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
@@ -83,21 +86,19 @@ def parts(qubits: int, seeds: int, seconds: float) -> dict[str, float]:
         ddqn._learn(picked)
         return time.process_time() - start
 
-    original = {name: getattr(kernels, name) for name in ("forward", "backward")}
-    for name, function in original.items():
-        setattr(kernels, name, timed("circuit", function))
+    original = hybrid.passes
+    hybrid.passes = timed("network", original)
     ddqn.envs.step = timed("environment", ddqn.envs.step)
     try:
         one_round()
-        spent.update(circuit=0.0, environment=0.0)
-        total = 0.0
-        while total < seconds:
-            total += one_round()
+        spent.update(network=0.0, environment=0.0)
+        rounds: list[float] = []
+        while sum(rounds) < seconds:
+            rounds.append(one_round())
     finally:
-        for name, function in original.items():
-            setattr(kernels, name, function)
-    shares = {name: part / total for name, part in spent.items()}
-    return {**shares, "torch": 1.0 - sum(shares.values())}
+        hybrid.passes = original
+    shares = {name: part / sum(rounds) for name, part in spent.items()}
+    return 1e3 * statistics.median(rounds), {**shares, "Python": 1.0 - sum(shares.values())}
 
 
 def controls(qubits: int) -> list[tuple[str, list[str]]]:
@@ -163,11 +164,17 @@ def main() -> None:
                     f"{model} qubits={n}, {seeds} seeds: {ms:.3f} ms per seed (ratio {base[seeds] / ms:.3g})",
                     flush=True,
                 )
-        for seeds in (1, 10):
-            shares = ", ".join(
-                f"{name} {share:.0%}" for name, share in parts(n, seeds, arguments.seconds).items()
+        for seeds in (1, 10, 50):
+            ms, divided = parts(n, seeds, arguments.seconds)
+            shares = ", ".join(f"{name} {share:.0%}" for name, share in divided.items())
+            ddqn, _ = training("vqc-native", [f"qubits={n}"], seeds)
+            seen = np.zeros((seeds, 100, ddqn.obs_dim), np.float32)
+            played = median_ms(lambda ddqn=ddqn, seen=seen: ddqn.act(seen), arguments.seconds)
+            print(
+                f"vqc-native qubits={n}, {seeds} seeds: {ms:.3f} ms a round of training ({shares}), "
+                f"{played:.3f} ms a pass of validation",
+                flush=True,
             )
-            print(f"a round of training, vqc-native qubits={n}, {seeds} seeds: {shares}", flush=True)
 
 
 if __name__ == "__main__":

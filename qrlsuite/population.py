@@ -123,25 +123,27 @@ def layers(
     return x
 
 
-def sweep(population: nn.Module, parameters: Sequence[Tensor], activation: str) -> Sweep | None:
-    """Return a population of layers as one compiled sweep, kept in it; None where `layers` is several, or torch's.
+def sweep(
+    population: nn.Module, parameters: Sequence[Tensor], make: Callable[[Sequence[Tensor]], Sweep]
+) -> Sweep | None:
+    """Return a population as the compiled sweep that `make(parameters)` is, kept in it; None where torch has to.
 
     The population's method `sweep` returns it, so that `chosen_errors` need not go through autograd.
 
     Parameters
     ----------
     parameters:
-        Of every layer the weights and the biases. They are moved in memory, so that they lie one behind the other.
+        All of them, in the sweep's order. They are moved in memory, so that they lie one behind the other.
     """
     kept: Sweep | None = population.__dict__.get("_sweep")
     if kept is not None and kept.places == [each.data_ptr() for each in parameters]:
         return kept
-    if activation == "tanh" or not compilable(*parameters):
+    if not compilable(*parameters):
         return None
-    from qrlsuite.compiled.perceptron import LayersSweep, in_one_block
+    from qrlsuite.compiled.perceptron import in_one_block
 
     in_one_block(parameters)
-    kept = population.__dict__["_sweep"] = LayersSweep(parameters[::2], parameters[1::2], activation)
+    kept = population.__dict__["_sweep"] = make(parameters)
     return kept
 
 
@@ -605,6 +607,7 @@ class Adam:
         parameters = [p for _, p in self._named]
         if any(p.grad is None for p in parameters):
             return False
+        whole = _sweep_of(self._population)  # first: it may move parameters
         if self._blocks is None or self._blocks[0] != [p.data_ptr() for p in parameters]:
             if not compilable(*parameters):
                 return False
@@ -623,7 +626,6 @@ class Adam:
         else:
             scale, root = np.array([_corrections(*self.betas, max(count, 1)) for count in counts]).T
             roots = root.astype(np.float32)
-        whole = _sweep_of(self._population)
         gradients = None if whole is None else whole.gradients_of(parameters)
         if gradients is None:
             gradients = joined([cast("Tensor", p.grad) for p in parameters])

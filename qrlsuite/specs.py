@@ -183,6 +183,8 @@ class ModelSpec(NumericSpec):
     backends:
         Whether it is a model for each circuit backend, of plugins too: registered as `NAME-BACKEND`, with the options
         `options["BACKEND"]`, which `qrlsuite.circuit.options_on` makes.
+    numerics_on:
+        `numerics` by backend, where the bits of its model on one changed alone.
     shared:
         Names of parameters with which all seeds are meant to begin alike, such as fixed features. Boards say so.
     """
@@ -197,6 +199,7 @@ class ModelSpec(NumericSpec):
     speedup: str = "much faster"
     quick: tuple[int, int] = (8, 10)
     backends: bool = False
+    numerics_on: Mapping[str, int] = field(default_factory=dict)
     shared: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -223,6 +226,7 @@ class ModelSpec(NumericSpec):
             faster=None if name == self.faster else self.faster,
             speedup=backend.speedup or self.speedup,
             quick=backend.quick or self.quick,
+            numerics=self.numerics_on.get(backend.name, self.numerics),
             backends=False,
         )
 

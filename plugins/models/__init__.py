@@ -82,6 +82,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             population="qrlsuite.plugins.models.vqc:population",
             faster="vqc-native",
             backends=True,
+            numerics_on={"native": 2},
         )
     )
     register(

@@ -114,7 +114,12 @@ class MLPPopulation(nn.Module):
         return None if scaled else self._whole()
 
     def _whole(self) -> Sweep | None:
-        return sweep(self, self._listed(), self.options.activation)
+        def made(own: Sequence[Tensor]) -> Sweep:
+            from qrlsuite.compiled.perceptron import LayersSweep
+
+            return LayersSweep(own[::2], own[1::2], self.options.activation)
+
+        return None if self.options.activation == "tanh" else sweep(self, self._listed(), made)
 
     def _listed(self) -> list[Tensor]:
         return cast("list[Tensor]", [*self._parameters.values()])  # in the order of their names in `MLP`

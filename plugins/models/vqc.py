@@ -30,7 +30,7 @@ import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import field, fields
-from typing import Annotated, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
@@ -47,7 +47,12 @@ from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
 from qrlsuite.plugins.models import mlp
 from qrlsuite.plugins.models.mlp import initial_layer
-from qrlsuite.population import ACTIVATIONS, linear
+from qrlsuite.population import ACTIVATIONS, compilable, linear, sweep
+
+if TYPE_CHECKING:
+    from qrlsuite.compiled.perceptron import Sweep
+    from qrlsuite.plugins.circuits.native import NativeBackend
+    from qrlsuite.plugins.circuits.native.hybrid import HybridSweep
 
 Activation = Literal["none", "relu", "tanh"]
 Readout = Literal["ansatz", "single", "pairs", "neighbors", "all-pairs", "product"]
@@ -377,7 +382,8 @@ class _Hybrid(nn.Module):
     def __deepcopy__(self, memo: dict[int, Any]) -> _Hybrid:
         copied = type(self).__new__(type(self))
         memo[id(self)] = copied
-        copied.__dict__.update({name: copy.deepcopy(value, memo) for name, value in self.__dict__.items()})
+        held = {name: value for name, value in self.__dict__.items() if name != "_sweep"}
+        copied.__dict__.update(copy.deepcopy(held, memo))
         # A target network follows its original's shot count, but must not draw the same samples.
         copied._copies = self._copies + 1
         return copied
@@ -392,7 +398,10 @@ class VQC(_Hybrid):
 
 
 class VQCPopulation(_Hybrid):
-    """S hybrid models: (S, B, in) -> (S, B, out); parameters and buffers as in `VQC` with a leading axis S."""
+    """S hybrid models: (S, B, in) -> (S, B, out); parameters and buffers as in `VQC` with a leading axis S.
+
+    `compiled`: all of a network is one compiled sweep on the CPU, and so is Adam's step.
+    """
 
     def __init__(self, modules: Sequence[VQC], options: VQCOptions) -> None:
         runner = _Runner(options)
@@ -401,10 +410,52 @@ class VQCPopulation(_Hybrid):
         super().__init__(
             runner, {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
         )
+        self.compiled = _is_sweep(runner)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
-        return self._stacked(x, dict(self.named_parameters()))
+        whole = self.sweep() if compilable(x) else None
+        return self._stacked(x, dict(self.named_parameters())) if whole is None else whole(x)
+
+    def sweep(self) -> HybridSweep | None:
+        """Return it as one compiled sweep, see `qrlsuite.population.sweep`."""
+        if not self.compiled:
+            return None
+        layers = (self.input, self.circuit, self.output)
+        parameters = [cast("Tensor", each) for layer in layers for each in layer._parameters.values()]
+        return cast("HybridSweep | None", sweep(self, parameters, self._made))
+
+    def compile_circuits(self) -> None:
+        """Let the code of the first pass be compiled, if it can."""
+        whole = self.sweep()
+        if whole is None:
+            super().compile_circuits()
+        else:
+            whole.compile()
+
+    def _made(self, parameters: Sequence[Tensor]) -> Sweep:
+        from qrlsuite.plugins.circuits.native.hybrid import HybridSweep
+
+        runner = self._runner
+        simulator = cast("NativeBackend", runner.backend).simulator()
+        return HybridSweep(parameters, simulator, runner.executions, self._refuse)
+
+    def _refuse(self, x: Tensor) -> None:
+        """Say why expectation values at x (S, B, in) are not finite."""
+        with torch.no_grad():
+            inner = linear(x, self.input.weight, self.input.bias)
+            self._runner.backend(inner, dict(self.circuit))
+
+
+def _is_sweep(runner: _Runner) -> bool:
+    """Return whether networks with exact circuits of `native` are what a hybrid sweep computes."""
+    own, backend = runner.options, runner.backend
+    plain = (own.linear, own.activation_in, own.activation_out, own.output_reuse, own.output_scale)
+    if plain != (True, "none", "none", 1, None) or (own.train, own.dtype) != ("all", "float32"):
+        return False
+    from qrlsuite.plugins.circuits.native import NativeBackend
+
+    return type(backend) is NativeBackend and backend.sweeps
 
 
 def build_circuit(options: VQCOptions) -> Circuit:

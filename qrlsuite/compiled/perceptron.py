@@ -101,7 +101,7 @@ class Sweep(ABC):
         values, _ = self.values(x, False)
         found = np.empty(values.shape[:2], np.float32)
         if places.shape != found.shape or not networks.chosen(values, places, found):
-            raise _unchosen(places, values)
+            raise unchosen(places, values)
         return found
 
     def chosen_errors(self, x: Array, places: NDArray[np.int64], aims: Array) -> Array:
@@ -111,16 +111,24 @@ class Sweep(ABC):
         share = np.float32(1.0) / np.float32(values.shape[1])
         fits = places.shape == aims.shape == errors.shape
         if not fits or not networks.chosen_errors(values, places, aims, share, errors, cotangents):
-            raise _unchosen(places, values)
+            raise unchosen(places, values)
         self.set_gradients(records, cotangents)
         return errors
 
     def set_gradients(self, records: Any, cotangents: Array) -> None:
         """Write the gradients of cotangents (S, B, out) to `grad` of trained parameters, in memory used again."""
+        self.pull(records, cotangents, self.own_gradients(), None)
+        self.show_gradients()
+
+    def own_gradients(self) -> Array:
+        """Return memory for gradients, always the same."""
         if self.kept_gradients is None:
             self.kept_gradients = np.empty_like(self.parameters)
             self._kept_parts = self.parts(self.kept_gradients)
-        self.pull(records, cotangents, self.kept_gradients, None)
+        return self.kept_gradients
+
+    def show_gradients(self) -> None:
+        """Let `grad` of trained parameters be what is in `own_gradients`."""
         for tensor, part in zip(self.tensors, self._kept_parts):
             tensor.grad = part if tensor.requires_grad else None
 
@@ -260,7 +268,8 @@ def _misfit(x: Sequence[int] | None, shapes: Sequence[Sequence[int]]) -> ValueEr
     )
 
 
-def _unchosen(places: NDArray[np.int64], values: Array) -> ValueError:
+def unchosen(places: NDArray[np.int64], values: Array) -> ValueError:
+    """Return the error of choices (S, B) that are no outputs (S, B, out)."""
     return ValueError(
         f"choose one of {values.shape[2]} outputs of each sample, of shape {values.shape[:2]}: the choice has the "
         f"shape {places.shape} and goes from {places.min(initial=0)} to {places.max(initial=0)}"

@@ -65,8 +65,10 @@ def test_initial_parameters_come_from_the_generator_and_lie_in_their_ranges():
     assert torch.equal(agents(1, small(ansatz="skolik"))[0].circuit["scaling"], torch.ones(2, 3))
 
 
-def test_deep_copies_are_independent_but_share_the_counter():
-    together = vqc.population(agents(2, small()), small())
+@pytest.mark.parametrize("backend", ["pennylane", "native"])
+def test_deep_copies_are_independent_but_share_the_counter(backend):
+    given = small(backend)
+    together = vqc.population(agents(2, given), given)
     target = copy.deepcopy(together)
     x = observations(2, 4, 3)
     before = together(x).detach()
@@ -82,9 +84,10 @@ def test_deep_copies_are_independent_but_share_the_counter():
     assert together.shot_count.tolist() == [0, 0], "exact models do not count passes"
 
 
+@pytest.mark.parametrize("backend", ["pennylane", "native"])
 @pytest.mark.parametrize("name", ["iqp", "cz"])
-def test_executions_are_those_of_each_agent(name):
-    given = small(ansatz=name)
+def test_executions_are_those_of_each_agent(name, backend):
+    given = small(backend, ansatz=name)
     together = vqc.population(agents(5, given), given)
     assert together.executions.as_dict() == {"forward": 0, "parameter_shift": 0}
     x = observations(5, 7, 3)
@@ -370,3 +373,99 @@ def test_values_are_repeated_and_outputs_scaled(linear):
         assert torch.equal(together(x)[s], module(x[s]))
     faster = agents(1, small("native", output_rate=10.0, output_scale=2.0))[0].learning_rates()
     assert faster == dict.fromkeys(("output.weight", "output.bias", "output.factor"), 10.0)
+
+
+def hybrid(seeds=3, obs=3, out=3, **values):
+    given = small("native", **values)
+    return vqc.population(agents(seeds, given, obs, out), given)
+
+
+def passes(model, x, cotangents):
+    """Return outputs, and gradients of inputs and parameters."""
+    x = x.detach().requires_grad_(True)
+    outputs = model(x)
+    return [outputs.detach(), *torch.autograd.grad(outputs, [x, *model.parameters()], cotangents)]
+
+
+@pytest.mark.parametrize(
+    ("obs", "out", "values"),
+    [
+        (3, 3, {}),
+        (5, 1, {"qubits": 4, "ansatz": "cz", "readout": "all-pairs"}),
+        (2, 4, {"qubits": 5, "gate": "u3"}),
+        (1, 2, {"ansatz": "skolik", "readout": "product"}),
+        (3, 3, {"ansatz": "cx", "ansatz_options": {"entangled": "separable"}}),
+    ],
+)
+def test_a_sweep_computes_what_torch_does_in_double_precision(obs, out, values):
+    swept, plain = hybrid(obs=obs, out=out, **values), hybrid(obs=obs, out=out, dtype="float64", **values)
+    assert swept.sweep() is not None
+    assert plain.sweep() is None
+    plain.load_state_dict({name: value.double() for name, value in swept.state_dict().items()})
+    for batch in (1, 16, 41):
+        x, cotangents = observations(3, batch, obs), observations(3, batch, out)
+        for mine, exact in zip(passes(swept, x, cotangents), passes(plain, x.double(), cotangents.double())):
+            torch.testing.assert_close(mine.double(), exact, rtol=2e-5, atol=2e-5)
+
+
+def test_a_seed_of_a_sweep_has_the_same_bits_alone_and_however_its_gradients_are_computed(monkeypatch):
+    given = small("native")
+    modules = agents(17, given)
+    x, cotangents, aims = observations(17, 45, 3), observations(17, 45, 3), observations(17, 45, 1)[..., 0]
+    chosen = (aims > 0).long()
+    together = vqc.population(modules, given)
+    expected = passes(together, x, cotangents)
+    errors = population.chosen_errors(together, x, chosen, aims)
+    gradients = [parameter.grad.clone() for parameter in together.parameters()]
+    values = together(x).gather(2, chosen[..., None])[..., 0]
+    by_torch = torch.autograd.grad((values - aims).square().mean(1).sum(), list(together.parameters()))
+    assert torch.equal(errors, (values - aims).detach())
+    assert all(torch.equal(mine, theirs) for mine, theirs in zip(gradients, by_torch))
+    for own in (slice(0, 1), slice(5, 7), slice(16, 17)):
+        alone = vqc.population(modules[own], given)
+        assert all(torch.equal(a, b[own]) for a, b in zip(passes(alone, x[own], cotangents[own]), expected))
+        population.chosen_errors(alone, x[own], chosen[own], aims[own])
+        assert all(torch.equal(a.grad, b[own]) for a, b in zip(alone.parameters(), gradients))
+    monkeypatch.setattr("qrlsuite.plugins.circuits.native.hybrid.KEEP_BYTES", 0)  # computed again
+    assert all(torch.equal(a, b) for a, b in zip(passes(together, x, cotangents), expected))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"shots": 10}, {"gradient": "spsa"}, {"dtype": "float64"}, {"linear": "behind"}, {"linear": False},
+     {"activation_in": "tanh"}, {"activation_out": "relu"}, {"output_reuse": 2}, {"output_scale": 2.0},
+     {"train": "scaling"}, {"ansatz": "cz", "ansatz_options": {"entangled": "mean-field"}}],
+)  # fmt: skip
+def test_other_networks_are_no_sweep_and_keep_their_optimizer(values):
+    model = hybrid(**values)
+    assert model.sweep() is None
+    assert not model.compiled
+    assert hybrid().compiled
+    pennylane = vqc.population(agents(1, small()), small())
+    assert pennylane.sweep() is None
+
+
+def test_fixed_parameters_of_a_sweep_stay():
+    """Adam then has a block of its own, and moves parameters into it at each step."""
+    model, x = hybrid(), observations(3, 5, 3)
+    model.circuit["weights"].requires_grad_(False)
+    adam, chosen = population.Adam(model, 0.1, 0.1), torch.zeros((3, 5), dtype=torch.int64)
+    for _ in range(2):
+        before = copy.deepcopy(model.state_dict())
+        population.chosen_errors(model, x, chosen, x[..., 0])
+        adam.step()
+        still = {name for name, value in model.state_dict().items() if torch.equal(value, before[name])}
+        assert still == {"circuit.weights", "shot_key", "shot_count"}
+    assert model.circuit["weights"].grad is None
+
+
+def test_a_sweep_says_what_is_wrong_with_its_inputs():
+    model, x = hybrid(), observations(3, 5, 3)
+    with pytest.raises(ValueError, match=r"take x \(3, B, 3\); x is \(3, 5, 4\)"):
+        model(observations(3, 5, 4))
+    with pytest.raises(ValueError, match=r"choose one of 3 outputs .* goes from 0 to 3"):
+        population.chosen_errors(model, x, torch.tensor([[0, 1, 2, 3, 0]] * 3), x[..., 0])
+    x[1, 4, 0] = torch.nan
+    for call in (model, lambda seen: population.best(model, seen)):
+        with pytest.raises(OptionError, match="the circuit's inputs or parameters are not finite"):
+            call(x)

@@ -108,6 +108,11 @@ class NativeBackend:
             return inputs.new_zeros((size, 0))
         return torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
 
+    @property
+    def sweeps(self) -> bool:
+        """Whether circuits are computed by the kernels that a hybrid network's sweep has (`hybrid`)."""
+        return self._sampler is None and not self.circuit.mean_field
+
     def compile_for(self, like: Tensor) -> None:
         """Compile the kernels, or load them, by a pass there and back of one sample of that dtype and device."""
         inputs = torch.zeros(
