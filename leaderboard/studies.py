@@ -185,12 +185,11 @@ def draw(
     study = find(name)
     named = {section.name: section for section in study.pictures}
     if kind not in named and kind in OF_LOOKS and study.looks is not None:
-        if settings or seeds is not None or horizon is not None or selection.labels:
+        if settings or seeds is not None or horizon is not None:
             raise OptionError(
-                f"picture '{kind}' of a study shows its looks as they are, with the names of its file: leave the "
-                "settings and --label out"
+                f"picture '{kind}' of a study shows its looks as they are: leave the settings out"
             )
-        return _of_looks(kind, names, selection.runs)
+        return _of_looks(kind, names, selection)
     if kind not in named and kind not in pictures.KINDS:
         known = [*named, *(OF_LOOKS if study.looks is not None else ()), *pictures.KINDS]
         raise UnknownNameError(f"study '{study.name}' has no picture '{kind}'{nearest(kind, known)}")
@@ -250,11 +249,11 @@ def drawn_by(name: str, section: PictureSection, members: Sequence[Member], runs
     return command("evaluate", *labels, "--task", shown[0].task.name, *numbers, "--out", out, runs=runs)
 
 
-def _of_looks(kind: str, names: Sequence[str], runs: Path) -> Composed:
+def _of_looks(kind: str, names: Sequence[str], selection: Selection) -> Composed:
     """Draw the pairs or the entries of studies with looks."""
     from qrlsuite.leaderboard.pictures import outcome as drawing  # matplotlib
 
-    outcomes = [read_outcome(name, runs) for name in names]
+    outcomes = [read_outcome(name, selection.runs).labeled(selection.labels) for name in names]
     if len(outcomes) > 1 and kind != "pairs":
         raise OptionError(f"picture '{kind}' shows one study: leave {', '.join(names[1:])} out")
     if len(outcomes) > 1:

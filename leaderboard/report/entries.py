@@ -83,6 +83,8 @@ def views(entries: Sequence[EntryResults]) -> list[EntryView]:
 
 def _facts(entry: EntryResults) -> list[tuple[str, str]]:
     classical, quantum = entry.parameters
+    tuning = (entry.tuning or {}).items()
+    tuned = {name: value for name, value in tuning if value and isinstance(value, str | int | float)}
     counts = f"{classical:,} classical, {quantum:,} quantum{entry.fixed_text}{_networks(entry)}"
     return [
         ("Name", clean(entry.name)),
@@ -101,7 +103,7 @@ def _facts(entry: EntryResults) -> list[tuple[str, str]]:
         ("Processor", _told(entry.processors)),
         ("Device", _told(entry.devices)),
         ("Settings", clean(entry.settings)),
-        ("Tuned", _tuned(entry.tuning)),
+        ("Tuned", _told(tuned)),
         ("Source", _told(entry.source)),
         ("Task definition", clean(entry.task_hash)),
     ]
@@ -152,17 +154,6 @@ def _networks(entry: EntryResults) -> str:
     return f" in {entry.networks} networks" if entry.networks is not None and entry.networks > 1 else ""
 
 
-def _tuned(record: Mapping[str, Any] | None) -> str:
-    """Return the budget of tuning."""
-    if record is None:
-        return ""
-    return ", ".join(
-        f"{clean(name)} {_plain(value)}"
-        for name, value in record.items()
-        if isinstance(value, str | int | float)
-    )
-
-
 def _told(value: Any) -> str:
     """Write a piece of provenance on one line; nothing where it is not known."""
     if not value:
@@ -171,7 +162,7 @@ def _told(value: Any) -> str:
         return ", ".join(f"{clean(name)} {_told(part)}".strip() for name, part in value.items())
     if isinstance(value, (list, tuple, set, frozenset)):
         return ", ".join(_told(part) for part in value)
-    return f"{value:,}" if isinstance(value, int) else clean(value)
+    return f"{value:,}" if isinstance(value, int) else clean(_plain(value))
 
 
 def _options(entry: EntryResults) -> list[tuple[str, tuple[tuple[str, str], ...]]]:

@@ -16,7 +16,7 @@ from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.boards.ranked import ranking_of, unranked_since
 from qrlsuite.leaderboard.boards.steps import Section
 from qrlsuite.leaderboard.boards.times import TimeRanking
-from qrlsuite.leaderboard.report import ladder, timed
+from qrlsuite.leaderboard.report import ladder
 from qrlsuite.leaderboard.report.cite import Citation, cite
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView, changed_options
@@ -24,8 +24,8 @@ from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.rows import RowView
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.winners import Winners, winners
-from qrlsuite.results.text import counted, hours_text, steps_text
-from qrlsuite.statistics import Evidence, Grid, Outcome
+from qrlsuite.results.text import counted, hours_text, p_text, steps_text
+from qrlsuite.statistics import Direction, Evidence, Grid, Outcome
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
@@ -68,13 +68,7 @@ class SectionView:
     framed: bool
     deltas: tuple[str, ...]
     data: dict[str, Any]
-    times: TimeRanking
     decisions: tuple[tuple[tuple[str, str], ...], ...]
-
-    @property
-    def others(self) -> int:
-        """Number of other entries that each one may outperform."""
-        return len(self.rows) - 1
 
 
 def view(section: Section, number: int, entries: dict[int, EntryView]) -> SectionView:
@@ -161,8 +155,9 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
         data=_data(section, judgement, rows, ranking),
-        times=section.times,
-        decisions=timed.matrix(section.times),
+        decisions=tuple(
+            tuple(_decision_cell(section.times, i, j) for j in order.tolist()) for i in order.tolist()
+        ),
     )
 
 
@@ -198,6 +193,15 @@ def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
     if wins == rest:
         return f"{first[0].name} outperforms {f'all {rest} others' if rest > 1 else 'the other entry'}."
     return f"{first[0].name} has rank 1 and outperforms {wins} of {rest} others."
+
+
+def _decision_cell(times: TimeRanking, i: int, j: int) -> tuple[str, str]:
+    """Return the text and the style of a cell of the matrix of adjusted p."""
+    board, direction = times.board, times.board.directions[i][j]
+    if i == j or direction is Direction.UNDECIDED:
+        return ("", "self") if i == j else ("?", "tie")
+    style = {Direction.FEWER: "win", Direction.MORE: "loss"}.get(direction, "tie")
+    return p_text(board.adjusted[i, j]) + "!" * bool(board.few[i, j]), style
 
 
 def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str]:

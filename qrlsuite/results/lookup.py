@@ -109,7 +109,8 @@ def definitions(tasks: Iterable[str]) -> dict[str, str]:
 def choose(among: Sequence[N], name: str, searched: object) -> N:
     """Return the entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
 
-    If several tasks have such an entry, `TASK/NAME` selects one. A whole name goes before a beginning.
+    If several tasks have such an entry, `TASK/NAME` selects one. A whole name goes before a beginning, and of several
+    that begin with it the entry that `run` would train.
 
     Parameters
     ----------
@@ -124,6 +125,8 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
             raise UnknownNameError(f"no entry '{name}' in {searched}{nearest(name, labels)}")
         raise UnknownNameError(f"no entry begins with '{name}'; did you mean {_choices(alike, among)}?")
     if len(found) > 1:
+        found = _written(found, name, bare=True) or found
+    if len(found) > 1:
         raise UnknownNameError(f"'{name}' may be any of {_choices(found, among)}: write one of these")
     return found[0]
 
@@ -134,11 +137,12 @@ def fitting(among: Sequence[N], name: str) -> list[N]:
     return whole or [e for e in among if any(known.startswith(name) for known in _names(e))]
 
 
-def _written(among: Sequence[N], text: str) -> list[N]:
+def _written(among: Sequence[N], text: str, bare: bool = False) -> list[N]:
     """Return the entries that a text in the notation of entries means.
 
     It is compared with labels, its options in any order, and then read as `run` reads it, with presets of tasks. A mark
-    of code may stand behind it: ` @1a2b3c4d`, or the beginning of one.
+    of code may stand behind it: ` @1a2b3c4d`, or the beginning of one. A model alone means none of its
+    entries, or `bare` the entry of its defaults.
     """
     text, at, mark = text.partition(" @")
     among = [e for e in among if not at or (mark and _mark(e).startswith(mark))]
@@ -152,8 +156,8 @@ def _written(among: Sequence[N], text: str) -> list[N]:
         return []
     if written.preset is None:
         same = [e for e in same_task if _same(written, e.label)]
-        if same or written.start or not written.settings:
-            return same if written.settings or written.start else []
+        if same or written.start or not (written.settings or bare):
+            return same if written.settings or written.start or bare else []
     names = {task: _name(task, written) for task in {e.task for e in same_task}}
     return [e for e in same_task if e.name.partition("@")[0] == names[e.task]]
 

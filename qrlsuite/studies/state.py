@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 import math
@@ -13,7 +14,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from qrlsuite.engine.sheet import Sheet
-from qrlsuite.engine.terminal import Shown, command
+from qrlsuite.engine.terminal import Shown, command, printable
+from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS
@@ -107,6 +109,31 @@ class State(Shown):
             for name in (pair.first, pair.second):
                 seeds[name] = max(seeds[name], pair.n_runs)
         return seeds
+
+    def labeled(self, words: Sequence[str]) -> State:
+        """Return the state with names of your own, `ENTRY=TEXT` each."""
+        called = {name: name for name in self.study.entries}
+        for word in words:
+            name = max((each for each in called if word.startswith(f"{each}=")), key=len, default="")
+            text = word[len(name) + 1 :].strip()
+            if not name or not text or text in called.values():
+                meant = nearest(word.rpartition("=")[0], called) * (not name)
+                raise OptionError(
+                    f"--label {printable(word)}: write ENTRY=TEXT, and another text for each entry{meant}"
+                )
+            called[name] = text
+
+        def renamed(values: Mapping[str, Any]) -> dict[str, Any]:
+            return {called[name]: value for name, value in values.items()}
+
+        study = copy.copy(self.study)
+        study.entries = renamed(study.entries)
+        pairs = (replace(p, first=called[p.first], second=called[p.second]) for p in self.pairs)
+        decision = replace(self.decision, pairs=tuple(pairs), wanted=renamed(self.decision.wanted))
+        facts: dict[str, Any] = {
+            name: renamed(getattr(self, name)) for name in ("seeds", "curves", "hours", "lost")
+        }
+        return replace(self, study=study, decision=decision, **facts)
 
     def mean_times(self) -> dict[str, MeanTime]:
         """Return M of each entry, its mean time below threshold, over the seeds of its last look.

@@ -37,9 +37,14 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks(t
     shown = say("show", "study", *TOGETHER).stdout
     assert "nothing follows for other tasks" in shown
     assert shown.count("10 qubits / width 14") == 1
-    assert "leave the settings and --label out" in refused(
-        "plot", "pairs", "--study", TOGETHER[0], "--label", "a=b"
-    )
+    named = ("--label", "10 qubits=Ten = 10", "--label", "width 14=Small")
+    assert "Ten = 10 / Small" in say("show", TOGETHER[0], *named).stdout
+    assert answer("plot", "pairs", "--study", TOGETHER[0], *named, "--runs", str(tmp_path))["picture"]
+    for wrong in ("10 qubit=Ten", "10 qubits=width 14", "10 qubits= "):
+        assert "write ENTRY=TEXT, and another text" in refused(
+            "plot", "pairs", "--study", TOGETHER[0], "--label", wrong
+        )
+    assert "only entries of a study with looks" in say("show", "study", *TOGETHER, "--label", "a=b").output
     say("show", "study", *TOGETHER, "--out", str(tmp_path / "table.tex"))
     assert (tmp_path / "table.tex").read_text().count("10 qubits / width 14 & ") == 1
 

@@ -58,6 +58,12 @@ def test_an_entry_answers_to_what_run_was_given() -> None:
     assert typed not in entry.label
     known = [Entry(entry.label, "cartpole", entry.name), *SEVERAL]
     assert lookup.choose(known, typed, "runs") is known[0]
+    usual = [resolve("cartpole", words) for words in ("vqc-native", "vqc-native layers=2")]
+    known = [Entry(each.label, "cartpole", each.name) for each in usual]
+    assert lookup.choose(known, "vqc-native", "runs") is known[0]
+    known = [Entry(f"ddqn mlp width={width}", "beam6g", f"ddqn-mlp-{width}") for width in (16, 64)]
+    assert lookup.choose(known, "mlp", "runs") is known[1]
+    assert lookup.fitting(known, "mlp") == known, "where several are asked for, it is the beginning of both"
 
 
 def test_a_default_that_was_not_typed_is_not_needed_where_the_plugin_is_gone() -> None:

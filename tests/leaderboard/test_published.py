@@ -704,8 +704,8 @@ def test_an_ambiguous_name_lists_entries_of_boards_where_some_fit(tmp_path: Path
     with pytest.raises(QrlSuiteError, match=r"may be any of .*'beam6g/ddqn mlp width=64': write") as raised:
         api.load("mlp width=64", runs=tmp_path, published=True)
     assert "beam6g-a5-0" not in str(raised.value)
-    with pytest.raises(QrlSuiteError, match="'ppo mlp' may be any of 'ppo mlp width=16'"):
-        api.load("ppo mlp", task="beam6g", runs=tmp_path, published=True)
+    with pytest.raises(QrlSuiteError, match="'ppo mlp width' may be any of 'ppo mlp width=16'"):
+        api.load("ppo mlp width", task="beam6g", runs=tmp_path, published=True)
 
 
 def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite.api.showing import describe, is_study
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, split_settings
+from qrlsuite.cli.arguments import JsonOption, LabelOption, PublishedOption, RunsOption, split_settings
 from qrlsuite.engine.sheet import text_of
 from qrlsuite.engine.terminal import printable_lines, table_console
 from qrlsuite.results.store import write_atomically
@@ -50,6 +50,7 @@ def show(
         bool,
         typer.Option("--identity", help="Show the code identity of an entry or a plugin, and its parts."),
     ] = False,
+    label: LabelOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -79,6 +80,14 @@ def show(
         found = describe(
             target, kind, settings=settings, code=code, out=out, format=format, runs=runs, published=published
         )
+    if label:
+        from qrlsuite.studies.state import State  # slow to import, and nothing else needs it
+
+        if not isinstance(found, State):
+            raise typer.BadParameter(
+                "--label: only entries of a study with looks take names of your own here"
+            )
+        found = found.labeled(label)
     if json_output:
         typer.echo(json.dumps(found if isinstance(found, dict) else found.as_dict()))
     elif not isinstance(found, dict) and out is not None:
