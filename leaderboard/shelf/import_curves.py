@@ -256,17 +256,11 @@ def _grid_of(points: Iterable[Points]) -> int:
 
 def _on_grid(own: Points, every: int, length: int, run: Run, instead: str) -> NDArray[np.float64]:
     """Return the scores at the first grid points (T,): each the last at or before it."""
-    if own.steps[0] > every:
-        raise FileError(
-            f"{own.source}: '{run[0]}', seed {run[1]} begins at step {own.steps[0]}, after the first grid point at "
-            f"{every}; scores are not carried backward: {instead}"
-        )
     if length > _MOST_GRID_POINTS:
         raise FileError(
             f"{own.source}: {length:,} grid points: every={math.ceil(length * every / GRID_POINTS)}"
         )
-    grid = every * np.arange(1, length + 1)
-    return own.scores[np.searchsorted(own.steps, grid, side="right") - 1]
+    return own.on_grid(every, length, f"{own.source}: '{run[0]}', seed {run[1]}", instead)
 
 
 def _require_reachable(

@@ -172,7 +172,7 @@ class _Run:
         except FileError:
             return
         every = self.file.protocol.interactions
-        self._require_begun(found)
+        self._on_grid(found, 1)
         epoch = min(int(found.steps[-1]) // every, self.entry.epochs)
         scores = self._scores(found.scores[:-1])
         if epoch > progress.epoch and len(scores):
@@ -192,15 +192,11 @@ class _Run:
             )
         return points.read_run(files, self.script.metric)
 
-    def _require_begun(self, found: Points) -> None:
-        every = self.file.protocol.interactions
-        if found.steps[0] > every:
-            new = self.entry.task.environment.name == EXTERNAL
-            cure = f"say every={found.steps[0]}" if new else "give a task with longer epochs"
-            raise QrlSuiteError(
-                f"{self.name}: its first score is at step {found.steps[0]}, after the first epoch of {every} steps: "
-                f"scores are not carried backward; {cure}"
-            )
+    def _on_grid(self, found: Points, epochs: int) -> NDArray[np.float64]:
+        """Return the scores after the first epochs (epochs,), each the last at or before its end."""
+        new = self.entry.task.environment.name == EXTERNAL
+        cure = f"say every={found.steps[0]}" if new else "give a task with longer epochs"
+        return found.on_grid(self.file.protocol.interactions, epochs, f"{self.name}: its curve", cure)
 
     def _scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return scores in the unit of the task: fractions of the best one where it has one."""
@@ -216,7 +212,7 @@ class _Run:
     def _curve(self) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """Return the scores after each epoch (T,), each the last at or before its end; and from what they are."""
         found, every = self._points(), self.file.protocol.interactions
-        self._require_begun(found)
+        scores = self._on_grid(found, self.entry.epochs)
         last, steps = int(found.steps[-1]), every * self.entry.epochs
         if last < (1 - REST) * steps:
             raise QrlSuiteError(
@@ -227,10 +223,8 @@ class _Run:
             raise QrlSuiteError(
                 f"{self.name}: its scores are '{found.metric}': say metric={found.metric}, or kind=NAME"
             )
-        grid = every * np.arange(1, self.entry.epochs + 1)
-        scores = self._scores(found.scores[np.searchsorted(found.steps, grid, side="right") - 1])
         origin = {"file": printable(found.source), "points": len(found.steps), "last_step": last}
-        return scores, {**origin, "command": shlex.join(self.words)}
+        return self._scores(scores), {**origin, "command": shlex.join(self.words)}
 
     def save(self, store: EntryStore, code: CodeIdentity, cpu: float) -> None:
         """Store the seed."""

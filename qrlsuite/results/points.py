@@ -85,6 +85,16 @@ class Points:
     source: str
     metric: str = ""
 
+    def on_grid(self, every: int, length: int, run: str, cure: str) -> NDArray[np.float64]:
+        """Return the scores at the first grid points (length,): each the last at or before it."""
+        if self.steps[0] > every:
+            raise FileError(
+                f"{run} begins at step {self.steps[0]}, after the first grid point at {every}; scores are not carried "
+                f"backward: {cure}"
+            )
+        grid = every * np.arange(1, length + 1)
+        return self.scores[np.searchsorted(self.steps, grid, side="right") - 1]
+
 
 class _Rows:
     """Collects points of runs, and refuses points that make no curve."""

@@ -393,7 +393,16 @@ class EntryRecord(CodedRecord):
         if self.identity.algorithm == SCRIPT:
             name = self.identity.model
             entry = of_script(task, name, scripts.build(name, self.identity.algorithm_options))
-            return self._same(replace(entry, tuning=self.tuned, study=self.plan), source)
+        else:
+            entry = self._built(task, source)
+        if entry.hash != self.hash:
+            raise StoreError(
+                f"{source} was made by a version of the suite or a plugin in which its options meant something else "
+                f"(hash {self.hash}, now {entry.hash}): keep it for reading, and choose another folder with --runs"
+            )
+        return replace(entry, tuning=self.tuned, study=self.plan)
+
+    def _built(self, task: Task, source: str) -> Entry:
         task.name = self.task_name
         algorithm = registry.get(specs.AlgorithmSpec, self.identity.algorithm)
         model = registry.get(specs.ModelSpec, self.identity.model)
@@ -401,27 +410,15 @@ class EntryRecord(CodedRecord):
         algorithm_options, model_options = (
             options.build(specs.resolve(spec.options), dict(values), source) for spec, values in sides
         )
-        entry = Entry(
+        return Entry(
             task=task,
             algorithm=algorithm,
             model=model,
             algorithm_options=algorithm_options,
             model_options=model_options,
             preset=self.preset,
-            tuning=self.tuned,
-            study=self.plan,
             start=self.identity.start,
         )
-        return self._same(entry, source)
-
-    def _same(self, entry: Entry, source: str) -> Entry:
-        """Return the entry that was built, if it has the record's hash."""
-        if entry.hash != self.hash:
-            raise StoreError(
-                f"{source} was made by a version of the suite or a plugin in which its options meant something else "
-                f"(hash {self.hash}, now {entry.hash}): keep it for reading, and choose another folder with --runs"
-            )
-        return entry
 
 
 class RunRecord(CodedRecord):

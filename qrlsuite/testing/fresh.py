@@ -38,8 +38,9 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
         `modules`: errors by module; `heavy`: heavy packages that registering imported; `references`: error or
         None by reference; `crash`: the last line of stderr, where the interpreter itself ended.
     """
+    copies = [str(each.source.copy) for each in own.loaded()]
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([_plugins(), modules, references])],
+        [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([copies, modules, references])],
         capture_output=True,
         text=True,
         check=False,
@@ -54,11 +55,6 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
             return answer
     lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
     return {"modules": {}, "heavy": [], "references": {}, "crash": lines[-1]}
-
-
-def _plugins() -> list[str]:
-    """Return the copies of the plugins that were loaded by path."""
-    return [str(each.source.copy) for each in own.loaded()]
 
 
 def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:

@@ -197,7 +197,7 @@ def test_failures_say_what_to_do(walk: Path) -> None:
     assert "invalid literal for int()" in refusal(command=f"{python} walk.py {{seed}} many 0")
     assert "say where its curve is, as in curve=logs/{seed}.csv" in refusal(curve="elsewhere-{seed}.csv")
     assert "its curve ends at step 50 of 100" in refusal(command=f"{python} walk.py {{seed}} 50 0")
-    assert "scores are not carried backward; say every=10" in refusal(every="5")
+    assert "scores are not carried backward: say every=10" in refusal(every="5")
     assert "cannot be started" in refusal(command="no-such-program {seed}")
     words_of_a_shell = [f"{word} ; touch pwned" if "command=" in word else word for word in words()]
     assert commands.qrlsuite(*words_of_a_shell).returncode == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
@@ -71,7 +72,8 @@ def check(
         raise typer.BadParameter("options are for one thing: name it, qrlsuite check KIND:NAME OPTION=VALUE")
     if json_output:
         results = [(item, _findings(item, chosen, more)) for item in items]
-        typer.echo(json.dumps([_plain(item, finding) for item, findings in results for finding in findings]))
+        rows = [(item, asdict(finding)) for item, findings in results for finding in findings]
+        typer.echo(json.dumps([{"kind": item.kind.kind, "name": item.name, **row} for item, row in rows]))
     else:
         results = _show(items, chosen, more)
     if not all(finding.ok for _, findings in results for finding in findings):
@@ -87,22 +89,10 @@ def _options_in(task: str, item: CheckTarget) -> dict[str, Any]:
 
 
 def _findings(item: CheckTarget, settings: dict[str, Any], more: dict[str, Any]) -> list[Finding]:
-
     try:
         return testing.check(item.kind.kind, item.name, settings, **more)
     except (Exception, SystemExit) as error:  # code that fails outside of any rule: the rest is still checked
         return [Finding("check", False, registry.words(error))]
-
-
-def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
-
-    return {
-        "kind": item.kind.kind,
-        "name": item.name,
-        "rule": finding.rule,
-        "ok": finding.ok,
-        "message": finding.message,
-    }
 
 
 def _show(
