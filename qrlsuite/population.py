@@ -7,12 +7,13 @@ agents' mean losses: gradients do not mix, and one elementwise optimizer serves 
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
@@ -184,7 +185,9 @@ def _chosen(values: Tensor, chosen: Tensor) -> Tensor:
     return values.gather(2, chosen[..., None]).squeeze(2)
 
 
-def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor) -> Tensor:
+def chosen_errors(
+    population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor, weight: float = 1.0
+) -> Tensor:
     """Set the gradients of a mean squared error, summed over the agents, in a population's parameters.
 
     A population of one compiled sweep does without autograd; the bits are equal.
@@ -197,6 +200,8 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
         The output of each sample that should equal its aim (S, B).
     aims:
         (S, B).
+    weight:
+        Factor on the error.
 
     Returns
     -------
@@ -206,10 +211,23 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
     compiled = _sweep_of(population)
     if compiled is None or not compilable(x, aims):
         errors = _chosen(population(x), chosen) - aims
-        gradients(errors.square().mean(1).sum(), population)
+        gradients(weight * errors.square().mean(1).sum(), population)
         return errors.detach()
-    parts = (each.detach().contiguous().numpy() for each in (x, chosen, aims))
-    return torch.from_numpy(compiled.chosen_errors(*parts))
+    seen, places, wanted = (each.detach().contiguous().numpy() for each in (x, chosen, aims))
+    return torch.from_numpy(compiled.chosen_errors(seen, places, wanted, weight))
+
+
+@contextlib.contextmanager
+def held(*populations: nn.Module) -> Iterator[None]:
+    """Let gradients pass through populations, and not be computed for their parameters."""
+    parameters = [p for each in populations for p in each.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)
 
 
 def compilable(*tensors: Tensor) -> bool:

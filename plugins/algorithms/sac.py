@@ -56,7 +56,17 @@ from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, DecaySteps, by_seed, follow, gradients, part, prefixed
+from qrlsuite.population import (
+    Adam,
+    DecaySteps,
+    by_seed,
+    chosen_errors,
+    follow,
+    gradients,
+    held,
+    part,
+    prefixed,
+)
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
@@ -296,22 +306,19 @@ class SAC:
         states = batch["observation"]
         with torch.no_grad():
             beyond, _ = self._soft(batch["arrived"], self.targets, noise[:, 0])
-            y = batch["reward"] + o.gamma * batch["alive"] * beyond[..., None]
+            y = (batch["reward"] + o.gamma * batch["alive"] * beyond[..., None]).squeeze(2)
         if self.discrete:
-            picked = batch["action"].long()
-            plain = masks.observed(states, self.obs_dim)
-            values = [critic(plain).gather(2, picked) for critic in self.critics]
-        else:
+            taken, picked = masks.observed(states, self.obs_dim), batch["action"].squeeze(2).long()
+        else:  # Q(s, a) is a critic's one output
             taken = torch.cat([states, batch["action"]], 2)
-            values = [critic(taken) for critic in self.critics]
-        errors = torch.stack([(value - y).square().mean((1, 2)) for value in values])
-        for name in ("critic_adam0", "critic_adam1"):
-            adams[name].zero_grad()
-        torch.autograd.backward(0.5 * errors.sum())
+            picked = torch.zeros(y.shape, dtype=torch.int64, device=self.device)
+        each = [chosen_errors(critic, taken, picked, y, weight=0.5) for critic in self.critics]
+        errors = torch.stack([own.square().mean(1) for own in each])
         for name in ("critic_adam0", "critic_adam1"):
             adams[name].step()
-        value, entropy = self._soft(states, self.critics, noise[:, 1])
-        gradients(-value.mean(1).sum(), self.actor)
+        with held(self.critics):
+            value, entropy = self._soft(states, self.critics, noise[:, 1])
+            gradients(-value.mean(1).sum(), self.actor)
         adams["actor_adam"].step()
         surplus = entropy.detach().mean(1) - self.least_entropy
         alpha = self.temperature.log.detach().exp()
@@ -319,7 +326,7 @@ class SAC:
             gradients((self.temperature.log * surplus).sum(), self.temperature)
             adams["temperature_adam"].step()
         follow(self.targets, self.critics, o.tau)
-        seen = (errors.detach().mean(0), value.detach().mean(1), entropy.detach().mean(1), alpha)
+        seen = (errors.mean(0), value.detach().mean(1), entropy.detach().mean(1), alpha)
         return torch.stack(seen).to(torch.float64)
 
     @torch.no_grad()

@@ -46,7 +46,7 @@ from qrlsuite.actions import from_units, size
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, follow, gradients, part, prefixed
+from qrlsuite.population import Adam, by_seed, chosen_errors, follow, gradients, held, part, prefixed
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
@@ -203,21 +203,20 @@ class TD3:
             action = (torch.tanh(self.target_actor(batch["arrived"])) + shift).clamp(-1.0, 1.0)
             beyond = torch.cat([batch["arrived"], action], 2)
             least = torch.minimum(*(critic(beyond) for critic in self.target_critics))
-            y = batch["reward"] + o.gamma * batch["alive"] * least
+            y = (batch["reward"] + o.gamma * batch["alive"] * least).squeeze(2)
         taken = torch.cat([batch["observation"], batch["action"]], 2)
-        losses = torch.stack([(critic(taken) - y).square().mean((1, 2)) for critic in self.critics])
-        for adam in self.critic_adams:
-            adam.zero_grad()
-        torch.autograd.backward(losses.sum())
+        only = torch.zeros(y.shape, dtype=torch.int64, device=self.device)  # Q(s, a) is a critic's one output
+        errors = [chosen_errors(critic, taken, only, y) for critic in self.critics]
         for adam in self.critic_adams:
             adam.step()
-        return losses.detach().mean(0).to(torch.float64)
+        return torch.stack([each.square().mean(1) for each in errors]).mean(0).to(torch.float64)
 
     def _learn_policy(self, observations: Tensor) -> Tensor:
         """Make one Adam step of every agent's actor, and let the copies follow; returns the values (S,)."""
-        action = torch.tanh(self.actor(observations))
-        values = self.critics[0](torch.cat([observations, action], 2)).mean((1, 2))
-        gradients(-values.sum(), self.actor)
+        with held(self.critics):
+            action = torch.tanh(self.actor(observations))
+            values = self.critics[0](torch.cat([observations, action], 2)).mean((1, 2))
+            gradients(-values.sum(), self.actor)
         self.actor_adam.step()
         follow(self.target_actor, self.actor, self.options.tau)
         follow(self.target_critics, self.critics, self.options.tau)

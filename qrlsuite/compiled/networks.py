@@ -230,9 +230,9 @@ def forward(x: Any, parameters: Any, sizes: Any, activation: int, records: Any, 
 @kernel
 def backward(
     cotangents: Any, parameters: Any, sizes: Any, activation: int, records: Any, pair: Any, turned: Any, sums: Any,
-    gradients: Any, x_gradients: Any, needed: bool,
+    gradients: Any, trained: bool, x_gradients: Any, needed: bool,
 ) -> None:  # fmt: skip
-    """Compute the gradients of a pass that kept its records, of parameters and, if `needed`, of x.
+    """Compute the gradients of a pass that kept its records: of parameters if `trained`, and of x if `needed`.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def backward(
         place = 0
         for layer in range(last + 1):
             o, i = sizes[layer + 1], sizes[layer]
-            for j in range(o):
+            for j in range(o if trained else 0):
                 gradients[place + seeds * o * i + s * o + j] = 0.0
             place += seeds * o * (i + 1)
         end = place
@@ -268,9 +268,11 @@ def backward(
                 o, i = sizes[layer + 1], sizes[layer]
                 begin, place = begin - i, place - seeds * o * (i + 1)
                 bias = place + seeds * o * i + s * o
-                for j in range(o):
+                for j in range(o if trained else 0):
                     gradients[bias + j] += total(load(own, 2 * j) + load(own, 2 * j + 1))
-                if i >= o:
+                if not trained:
+                    pass
+                elif i >= o:
                     columns = -(-i // vector)
                     _turn(rows, begin, i, columns, samples, turned)
                     _add_products(own, zero, o, turned, columns, samples, sums, at)
@@ -300,7 +302,7 @@ def backward(
             o, i = sizes[last - back + 1], sizes[last - back]
             place -= seeds * o * (i + 1)
             columns = -(-max(i, o) // vector) * vector
-            for j in range(o):
+            for j in range(o if trained else 0):
                 gradient = gradients[place + (s * o + j) * i : place + (s * o + j + 1) * i]
                 if i >= o:
                     own = sums[at + j * columns : at + (j + 1) * columns]  # of slices, see `adam`

@@ -82,6 +82,12 @@ class Sweep(ABC):
     def pull(self, records: Any, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
         """Write the gradients of the parameters (in their layout) and of x, given cotangents (S, B, out)."""
 
+    def pull_x(self, records: Any, cotangents: Array) -> Array:
+        """Return the gradient of x alone (S, B, in), given cotangents (S, B, out)."""
+        x_gradient = np.empty((*cotangents.shape[:2], self.inputs), np.float32)
+        self.pull(records, cotangents, np.empty_like(self.parameters), x_gradient)
+        return x_gradient
+
     def __call__(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
         if torch.is_grad_enabled() and (x.requires_grad or any(each.requires_grad for each in self.tensors)):
@@ -104,11 +110,11 @@ class Sweep(ABC):
             raise unchosen(places, values)
         return found
 
-    def chosen_errors(self, x: Array, places: NDArray[np.int64], aims: Array) -> Array:
-        """Return one output of each sample minus its aim (S, B); set the gradients of their summed mean squares."""
+    def chosen_errors(self, x: Array, places: NDArray[np.int64], aims: Array, weight: float = 1.0) -> Array:
+        """Return one output of each sample minus its aim (S, B); set the gradients of their mean squares' sum."""
         values, records = self.values(x, True)
         errors, cotangents = np.empty(values.shape[:2], np.float32), np.empty_like(values)
-        share = np.float32(1.0) / np.float32(values.shape[1])
+        share = np.float32(weight) / np.float32(values.shape[1])
         fits = places.shape == aims.shape == errors.shape
         if not fits or not networks.chosen_errors(values, places, aims, share, errors, cotangents):
             raise unchosen(places, values)
@@ -184,6 +190,17 @@ class LayersSweep(Sweep):
 
     def pull(self, records: Records, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
         """Write gradients, see `Sweep`."""
+        self._pull(records, cotangents, gradients, x_gradient)
+
+    def pull_x(self, records: Records, cotangents: Array) -> Array:
+        """Return the gradient of x alone, without those of the parameters."""
+        x_gradient = np.empty((*cotangents.shape[:2], self.inputs), np.float32)
+        self._pull(records, cotangents, None, x_gradient)
+        return x_gradient
+
+    def _pull(
+        self, records: Records, cotangents: Array, gradients: Array | None, x_gradient: Array | None
+    ) -> None:
         pair, turned, sums = (Records(*shape) for shape in self.shapes_of_work)
         networks.backward(
             cotangents,
@@ -194,7 +211,8 @@ class LayersSweep(Sweep):
             pair.array,
             turned.array.reshape(-1),
             sums.array.reshape(-1),
-            gradients,
+            np.empty(1, np.float32) if gradients is None else gradients,
+            gradients is not None,
             np.empty((1, 1, 1), np.float32) if x_gradient is None else x_gradient,
             x_gradient is not None,
         )
@@ -311,6 +329,12 @@ class _Swept(torch.autograd.Function):
         _ = ctx.saved_tensors  # refuses those that changed since
         sweep, cotangent = ctx.sweep, array(cotangents[0])
         x_gradient = None
+        if not any(ctx.needs_input_grad[2:]):
+            return (
+                torch.from_numpy(sweep.pull_x(ctx.records, cotangent)),
+                None,
+                *[None for _ in sweep.tensors],
+            )
         if ctx.needs_input_grad[0]:
             x_gradient = np.empty((*cotangent.shape[:2], sweep.inputs), np.float32)
         gradients = np.empty_like(sweep.parameters)

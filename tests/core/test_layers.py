@@ -14,7 +14,7 @@ from torch import Tensor
 
 from qrlsuite.compiled import networks, perceptron, vectors
 from qrlsuite.plugins.models import mlp
-from qrlsuite.population import ACTIVATIONS, Adam, best, chosen_errors, chosen_values, layers
+from qrlsuite.population import ACTIVATIONS, Adam, best, chosen_errors, chosen_values, held, layers
 
 SIZES = [(3, 16, 16, 3), (3, 10, 1), (5, 7), (1, 1, 1), (2, 33, 18, 64, 4), (40, 8, 2)]
 
@@ -248,10 +248,10 @@ def test_errors_without_autograd_have_its_bits_and_those_of_the_steps_that_follo
     ours = mlp.population([mlp.build(3, 4, options, g) for _ in range(seeds)], options)
     theirs = Behind(copy.deepcopy(ours))
     adams = [Adam(each, 0.01, 0.01) for each in (ours, theirs)]
-    for _ in range(3):
+    for weight in (1.0, 0.5, 0.3):
         x, aims = torch.randn(seeds, batch, 3, generator=g), torch.randn(seeds, batch, generator=g)
         chosen = torch.randint(4, (seeds, batch), generator=g)
-        errors = [chosen_errors(each, x, chosen, aims) for each in (ours, theirs)]
+        errors = [chosen_errors(each, x, chosen, aims, weight) for each in (ours, theirs)]
         assert torch.equal(*errors)
         assert torch.equal(*(best(each, x) for each in (ours, theirs)))
         assert torch.equal(*(chosen_values(each, x, chosen) for each in (ours, theirs)))
@@ -260,6 +260,13 @@ def test_errors_without_autograd_have_its_bits_and_those_of_the_steps_that_follo
         for adam in adams:
             adam.step()
         assert all(torch.equal(p, q) for p, q in zip(ours.parameters(), theirs.parameters()))
+    (expected,) = torch.autograd.grad(theirs(x.requires_grad_()).square().sum(), x)
+    with held(ours):
+        passed = ours(x).square().sum()
+        assert torch.equal(torch.autograd.grad(passed, x)[0], expected)
+        assert not any(p.requires_grad for p in ours.parameters())
+    assert all(p.requires_grad for p in ours.parameters())
+    x = x.detach()
     x[0, 0] = torch.nan
     assert torch.equal(*(best(each, x) for each in (ours, theirs)))
     assert (ours.sweep() is None) == (activation == "tanh" or scale != 1.0)

@@ -273,12 +273,12 @@ class HybridSweep(Sweep):
         self._pass(x, kept, kept is None, np.empty_like(cotangents), wanted)
         self.executions.count_backward(x.shape[1])
 
-    def chosen_errors(self, x: Array, places: NDArray[np.int64], aims: Array) -> Array:
+    def chosen_errors(self, x: Array, places: NDArray[np.int64], aims: Array, weight: float = 1.0) -> Array:
         """Return errors and set gradients, see `Sweep`: chunk by chunk there and back, which keeps no records."""
         out, errors = np.empty((*x.shape[:2], self.outputs), np.float32), np.empty(x.shape[:2], np.float32)
         if not places.shape == aims.shape == errors.shape:
             raise unchosen(places, out)
-        share = np.float32(1.0) / np.float32(x.shape[1])
+        share = np.float32(weight) / np.float32(x.shape[1])
         own = self.own_gradients()
         wanted = _Differentiated(
             OF_ERRORS, chosen=places, aims=aims, share=share, errors=errors, gradients=own
