@@ -296,7 +296,6 @@ _SPECIAL = {
     "|": r"\textbar{}",
     '"': r"\symbol{34}",
     "`": r"\textasciigrave{}",
-    "'": r"\symbol{39}",
     "[": "{[}",  # a row that begins with one would be read as an option of the row before
     "]": "{]}",
     "†": r"\dag{}",
@@ -310,7 +309,8 @@ def escaped(text: str) -> str:
     lr=2e-3 50\% \& a\_b
     """
     plain = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in " ".join(text.split()))
-    return "".join(_SPECIAL.get(c, c) for c in plain).replace("--", "-{}-")  # two would become a dash
+    shown = "".join(_SPECIAL.get(c, c) for c in plain)
+    return shown.replace("--", "-{}-").replace("''", "'{}'")  # two would become a dash, or a quotation mark
 
 
 def _math(cell: str) -> str:

@@ -117,7 +117,7 @@ class Overview(Shown):
             yield Text(file.source)
         if file.reports:
             yield Text(f"Reported there: {file.reports}")
-        yield self.sheets()[0] if self.works else Text("nothing to train")
+        yield replace(self.sheets()[0], title="") if self.works else Text("nothing to train")
         lacking = [each for each in self._measured if each[0].groups]
         if self.works and not lacking:
             yield Text("everything is there")
@@ -152,7 +152,8 @@ class Overview(Shown):
                 "-" if cost == 0 else "?" if span is None else duration_range(*span),
             )
             rows.append(cells)
-        return [Sheet.of("", heads, rows, words=("task", "entry", "core time left"))]
+        words = ("task", "entry", "core time left")
+        return [Sheet.of(self.study.summary, heads, rows, words=words, label=self.study.name)]
 
 
 def _finished(work: Missing) -> int:

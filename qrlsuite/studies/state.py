@@ -263,7 +263,7 @@ class State(Shown):
         if not self.begun:
             yield from map(Text, self._design())
         for sheet in self.sheets():
-            if sheet.title:
+            if sheet.title != study.file.summary:
                 yield Text(sheet.title, style="bold")
             yield replace(sheet, title="")
         if any(pair.p for pair in self.pairs):
@@ -291,7 +291,7 @@ class State(Shown):
         """Return a table of pairs for each question."""
         pairs = list(zip(self.pairs, self.as_dict()["pairs"]))
         return [
-            replace(_sheet(self, of), title=asked, label=self.study.name)
+            replace(_sheet(self, of), title=asked or self.study.file.summary, label=self.study.name)
             for asked, of in by_question(self.study, pairs)
         ]
 
