@@ -57,7 +57,8 @@ class Subjects:
     @functools.cached_property
     def sampled(self) -> bool:
         """Whether outputs or gradients are random, as of a circuit with shots or noise."""
-        return any(getattr(part, "draws", False) for part in self._raw(0).modules())
+        drawn = any(getattr(part, "draws", False) for part in self._raw(0).modules())
+        return drawn or getattr(self.options, "shots", None) is not None
 
     def _builds(self, options: Any) -> bool:
         try:
