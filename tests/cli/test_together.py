@@ -47,7 +47,10 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks(t
     assert "only entries of a study with looks" in say("show", "study", *TOGETHER, "--label", "a=b").output
     say("show", "study", *TOGETHER, "--out", str(tmp_path / "table.tex"))
     assert (tmp_path / "table.tex").read_text().count("10 qubits / width 14 & ") == 1
-    captions = {"fig7": "Scaling with size: networks", "equal-size-pulse": "Does a circuit need fewer steps than"}
+    captions = {
+        "fig7": "Scaling with size: networks",
+        "equal-size-pulse": "Does a circuit need fewer steps than",
+    }
     for study, caption in captions.items():
         say("show", study, "--out", str(tmp_path / "one.tex"))
         assert f"\\caption{{{caption}" in (tmp_path / "one.tex").read_text()

@@ -16,6 +16,7 @@ from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.leaderboard.boards import board, ranked
 from qrlsuite.leaderboard.boards.compared import compare_entries
+from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import DifferentCurvesError, EntryResults
 from qrlsuite.results.records import EntryRecord
@@ -124,6 +125,9 @@ def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
         output, picture = plot(kind, "--published")
         assert "left out: ddqn mlp width=16: ends at 2000 steps; --horizon 2000 shows it" in output
         assert "all cut to" not in picture
+        among = collect.Selection.create(with_smoke, "beam6g", True)
+        made = compose(kind, among, settings={}, environment={})
+        assert [entry.color for entry in made.entries] == list(range(len(made.entries))), "of those drawn"
     output, picture = plot("bars", "--published", "--horizon", "2000")
     assert "left out" not in output
     output, _ = plot("curves", "--published")  # which cuts nothing
