@@ -1,12 +1,13 @@
 """Level, direction and coverage of tests for a difference in mean steps, on generated runs alone: no stored curve.
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/laws.py [--pairs 2000] [equal | coverage | power]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/laws.py [--pairs 2000] [equal | coverage | power | spread]
 
 A run is one number: its mean time below threshold in epochs, from 0 to a horizon of 100 in multiples of 1/2, plus half
 an epoch. Four tests of equal means are compared. Three relabel whole runs: Welch's t (`welch`), the log ratio over its
 delta-method standard error (`steps`), and the same corrected for skewness by Hall's cubic (`skewed`); `bootstrap`
 compares the log ratio's t with its bootstrap distribution. All labelings are enumerated where there are at most 1000,
-else 999 are drawn. The tables of docs/error-rates.md about generators are its output.
+else 999 are drawn. `spread` tests with Welch's t whether seeds are equally far from their entry's median seed. The
+tables of docs/error-rates.md about generators are its output.
 """
 
 from __future__ import annotations
@@ -187,6 +188,42 @@ def print_equal(pairs: int) -> None:
             line(name, variant, *(float(each[place].sum()) for each in rates))
 
 
+def shifted(law: Law, by: float) -> Law:
+    return lambda g, shape: law(g, shape) + by
+
+
+def as_spread(law: Law) -> Law:
+    """Return a normal law whose numbers are as far from its median, on average, as those of a law."""
+    drawn = law(np.random.default_rng(0), (1_000_000,))
+    return normal(60, float(np.abs(drawn - np.median(drawn)).mean()) * (np.pi / 2) ** 0.5 / 60)
+
+
+def print_spread(pairs: int) -> None:
+    """Print how often equal spreads are found to differ, and one that is twice the other."""
+    counts = (*((n, n) for n in SEEDS), (20, 100), (100, 20))
+    laws = {name: (law, law) for name, law in EQUAL_LAWS.items()}
+    named = {"lognormal, cv .4": USUAL, "lognormal, sd 1": LONG, "5% fail": failing(USUAL, 0.05)}
+    laws |= {f"{name}; 40 epochs later": (law, shifted(law, 40)) for name, law in named.items()}
+    laws |= {f"{name}; normal": (law, as_spread(law)) for name, law in named.items()}
+    laws["normal, cv .1; cv .2 (power)"] = normal(30, 0.1), normal(30, 0.2)
+    head(f"Spread, {pairs} pairs: found to differ", "laws", *(f"{n}, {m}" for n, m in counts))
+    for name, pair in laws.items():
+        rates = []
+        for each in counts:
+            generator, found = np.random.default_rng([2, *each]), 0
+            labels = labelings(*each, generator)
+            for _ in range(0, pairs, 250):
+                sides = [np.rint(2 * law(generator, (250, n))) / 2 for law, n in zip(pair, each, strict=True)]
+                apart = [np.abs(side - np.median(side, axis=1, keepdims=True)) for side in sides]
+                both = (
+                    np.concatenate(apart, axis=1) + 0.5
+                )  # `moments` divides by the mean, and t takes differences
+                t = t_of("welch", moments(both, labels, each[0]), moments(both, 1 - labels, each[1]))
+                found += np.sum((np.abs(t) >= np.abs(t[:, :1]) * (1 - 1e-9)).mean(axis=1) <= LEVEL)
+            rates.append(float(found / (250 * -(-pairs // 250))))
+        line(name, *rates)
+
+
 def print_coverage(pairs: int) -> None:
     head(f"{pairs} pairs: the 95% interval holds the ratio", "laws", "ratio", "variant", *map(str, SEEDS))
     for ratio in (1.0, 2.0, 5.0):
@@ -207,7 +244,7 @@ def print_power(pairs: int) -> None:
                 line(name, f"{mean_of(laws[1]) / mean_of(laws[0]):.2f}", variant, *shown)
 
 
-PARTS = {"equal": print_equal, "coverage": print_coverage, "power": print_power}
+PARTS = {"equal": print_equal, "coverage": print_coverage, "power": print_power, "spread": print_spread}
 
 
 def main() -> None:

@@ -114,7 +114,8 @@ def pair(row: Row, match: re.Match[str]) -> Row:
     """Return the row of a pair of entries."""
     task, first, second = match["task"], match["first"], match["second"]
     board = board_of(match["study"], task)
-    cells = api.compare(load(first, task), load(second, task))
+    cells = api.compare(load(first, task), load(second, task), rule="paper").cells
+    assert cells is not None
     entries = {each.entry.label: each.entry for each in board.rows}
     i, j = (board.order[list(entries).index(label)] for label in (first, second))
     change = f"steps below threshold {percent(board.board.difference[i, j])}"
@@ -294,7 +295,9 @@ def against(count: int) -> tuple[list[int], list[str], Counter[Verdict]]:
         change = percent(board.mean[circuit] / board.mean[network] - 1)
         texts.append(f"{change} ({word}, p {board.adjusted[circuit, network]:.4f})")
         for task in tasks:
-            cells = api.compare(load(f"ddqn {MODELS[3]}", task), load(f"ddqn {model}", task))
+            pair = load(f"ddqn {MODELS[3]}", task), load(f"ddqn {model}", task)
+            cells = api.compare(*pair, rule="paper").cells
+            assert cells is not None
             verdicts.update(each for line in cells.verdicts for each in line)
     return signs, texts, verdicts
 
@@ -409,7 +412,9 @@ def five_runs() -> tuple[str, ...]:
 def cut() -> tuple[str, ...]:
     """The cells of CartPole at epsilon 0.05."""
     first, second = "reinforce vqc-native qubits=4 layers=1", "reinforce mlp width=16 depth=1"
-    cells = api.compare(load(first, "cartpole"), load(second, "cartpole")).verdicts[0]
+    found = api.compare(load(first, "cartpole"), load(second, "cartpole"), rule="paper").cells
+    assert found is not None
+    cells = found.verdicts[0]
     won, lost = cells.count(Verdict.WIN), cells.count(Verdict.LOSS)
     assert won + lost < len(cells), (
         "every cell is significant: the statement about epsilon 0.05 does not hold"

@@ -54,8 +54,8 @@ def read_outcome(name: str, runs: Path) -> State:
     """Return the outcome of a study with looks: of the results folder if it has begun there, else the published one."""
     found, folder = find(name), published_studies.folder_of(name)
     if folder is not None and (folder == Path(name) or not has_begun(runs, found.name)):
-        return published_studies.read(folder)
-    return Study(found, runs).read()
+        return published_studies.noted(published_studies.read(folder))
+    return published_studies.noted(Study(found, runs).read())
 
 
 def check(study: StudyFile) -> None:

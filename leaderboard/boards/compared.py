@@ -1,9 +1,9 @@
-"""Two entries compared: the verdict by steps below threshold, and the cells of the sample-complexity surface."""
+"""Two entries compared: the verdict by steps, and on request the cells of the sample-complexity surface."""
 
 from __future__ import annotations
 
 import textwrap
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from rich import box
@@ -23,42 +23,34 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults, edited_between
 from qrlsuite.statistics import Comparison, SignificanceRule, compare
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class EntryComparison(Shown, Comparison):
-    """The result of `compare_entries`. It shows itself as a verdict, a table of thresholds, and the cells in a line.
+@dataclass(frozen=True, eq=False, repr=False)
+class EntryComparison(Shown):
+    """The result of `compare_entries`. It shows itself as a verdict, a table of thresholds, and notes.
 
     Attributes
     ----------
-    labels:
-        Names of the two entries.
+    names:
+        Names of the two entries; `pair.labels` are for readers.
     pair:
         The verdict by steps below threshold, and the final scores.
     remarks:
         Notes on the entries, as below a board: those that may turn the verdict first.
-    show_cells:
-        Whether the cells are shown one by one: a rule was asked for.
-    missing:
-        Sentences about the seeds that were asked for and are not there, or were withdrawn.
+    cells:
+        The verdict of every cell of the task's grid by the rule that was asked for; None without one.
     among:
         The pair's verdict on its task's board; None if it was not looked up, or the board has no other entry.
     """
 
-    labels: tuple[str, str]
+    names: tuple[str, str]
     pair: PairVerdict
     remarks: tuple[str, ...] = ()
-    show_cells: bool = False
-    missing: tuple[str, ...] = ()
+    cells: Comparison | None = None
     among: OnBoard | None = None
 
     @property
-    def verdict(self) -> str:
-        """Which entry needs fewer steps, by how much and how surely, in a sentence."""
-        return self.pair.sentence
-
-    @property
     def sentence(self) -> str:
-        """The verdict."""
-        return self.verdict
+        """Which entry needs fewer steps, by how much and how surely, and both final scores."""
+        return self.pair.sentence
 
     @property
     def p(self) -> float:
@@ -77,67 +69,59 @@ class EntryComparison(Shown, Comparison):
         return float(low), float(high)
 
     @property
-    def headline(self) -> str:
-        """Who is compared with whom cell by cell, and at how many seeds and steps."""
-        one, other = self.labels
-        rule = "" if self.rule == DEFAULT else f", rule '{self.rule}'"
-        return f"{one} against {other}, {self.n_runs} seeds each, {self.horizon} steps{rule}"
-
-    @property
     def cells_line(self) -> str:
-        """The verdict of the rule for cells of the sample-complexity surface."""
-        rule = "the paper's rule" if self.rule == DEFAULT else f"rule '{self.rule}'"
-        return f"by {rule}, cell by cell: {super().sentence}"
+        """The verdict of the rule for cells of the sample-complexity surface; empty without one."""
+        if self.cells is None:
+            return ""
+        rule = "the paper's rule" if self.cells.rule == DEFAULT else f"rule '{self.cells.rule}'"
+        return f"by {rule}, cell by cell, {self.cells.n_runs} seeds each: {self.cells.sentence}"
 
     @property
     def further(self) -> list[str]:
         """The lines below the table of thresholds."""
         board = self.among.text if self.among is not None else ""
-        return [line for line in (board, self.pair.final, self.cells_line, *self.remarks) if line]
-
-    @property
-    def legend(self) -> str:
-        """Meanings of the signs in the table of cells."""
-        return legend(self)
+        return [line for line in (board, *self.remarks, self.cells_line) if line]
 
     def sheets(self) -> list[Sheet]:
         """Return the table of thresholds for a file, with the verdict as its caption."""
         heads = self.pair.columns()
-        notes = (self.verdict, *self.pair.notes, *self.further)
+        notes = (self.sentence, *self.pair.notes, *self.further)
         return [Sheet.of("", heads, self.pair.rows(), notes, words=(heads[0], heads[-1]), label="verdict")]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the comparison as plain values, for JSON: the cells, and `verdict` and `times` beside them."""
+        """Return the comparison as plain values, for JSON."""
         return {
-            **super().as_dict(),
-            "sentence": super().sentence,
-            "verdict": self.verdict,
+            "names": list(self.names),
+            "horizon": self.pair.times.horizon,
+            "verdict": self.sentence,
             "times": self.pair.as_dict(),
             "board": None if self.among is None else asdict(self.among),
-            **({"missing": self.missing} if self.missing else {}),
+            "notes": list(self.remarks),
+            **({} if self.cells is None else {"cells": self.cells.as_dict()}),
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(self.verdict)
+        yield Text(self.sentence)
         yield pair_table(self.pair)
         yield Text("\n".join(self.further))
-        if self.show_cells:
-            yield Text(f"\n{self.headline}:")
-            yield comparison_table(self)
-            yield Text(self.legend)
+        if self.cells is not None:
+            yield comparison_table(self.cells)
+            yield Text(legend(self.cells))
 
 
 def compare_entries(
-    first: EntryResults, second: EntryResults, rule: SignificanceRule | None = None
+    first: EntryResults, second: EntryResults, rule: SignificanceRule | None = None, by: str = "steps"
 ) -> EntryComparison:
-    """Compare two entries of one task: by steps below threshold, by final score, and cell by cell of its ranking grid.
+    """Compare two entries of one task: by steps below threshold, and by final score.
 
     Parameters
     ----------
     first, second:
         The entries.
     rule:
-        Decides what is significant in a cell; None means the task's rule, or the paper's if the task names none.
+        Judges each cell of the task's grid, too; None means the rule that the task names, if it names one.
+    by:
+        See `judge_pair`.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(
@@ -153,18 +137,12 @@ def compare_entries(
         raise QrlSuiteError(f"'{first.label}' is compared with itself: name another entry")
     epochs = min(first.curves.shape[1], second.curves.shape[1])
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
-    grid, asked = ranking_of([first, second]).grid, rule is not None
-    pair = judge_pair(first, second, grid, ALPHA)
-    rule = rule or rule_of([first, second])
-    comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
-    values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
     both = [first, second]
-    flattered = [f"{entry.label}: {tables.MARKS['†']}" for entry in both if entry.on_protocol_seeds]
-    remarks = (*tables.doubts(both), *flattered, *tables.remarks(both))
-    missing = tuple(tables.missing(both))
-    return EntryComparison(
-        **values, labels=pair.labels, pair=pair, remarks=remarks, show_cells=asked, missing=missing
-    )
+    ranking = ranking_of(both)
+    pair, cells = judge_pair(first, second, ranking.grid, ALPHA, by), None
+    if rule or ranking.rule:
+        cells = compare(learning_curves(first), learning_curves(second), ranking.grid, rule or rule_of(both))
+    return EntryComparison((first.name, second.name), pair, tuple(tables.about(both)), cells)
 
 
 SYMBOLS = {

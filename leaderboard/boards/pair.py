@@ -1,29 +1,35 @@
-"""Two entries in words: which needs fewer steps, by how much and how surely; threshold by threshold; and at the end."""
+"""Two entries in words: which needs fewer steps, by how much and how surely, and their final scores."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from qrlsuite.leaderboard.boards import scores
 from qrlsuite.leaderboard.boards.ranked import ranking_of
+from qrlsuite.leaderboard.boards.scores import ScoreSection
 from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.text import counted, interval_text, mean_text, p_text, percent, share_text, steps_text
+from qrlsuite.results.text import (
+    counted,
+    interval_text,
+    mean_text,
+    p_text,
+    percent,
+    said,
+    share_text,
+    steps_text,
+)
 from qrlsuite.statistics import (
     MIN_RUNS,
     Direction,
     Grid,
     LearningCurves,
-    ScoreBoard,
     TimesPair,
-    common_horizon,
-    compare_scores,
-    final_scores,
-    last_epochs,
     times_board,
     times_pair,
 )
@@ -80,15 +86,15 @@ class PairVerdict:
     thresholds:
         Thresholds of the grid, in units of the score.
     scores:
-        The comparison by final scores; None if an entry has a single run.
-    n_last:
-        Number of epochs in the first entry's final score, a mean.
+        The comparison by final scores, or by another number of each seed; None if an entry has a single run.
+    places:
+        The two among its entries.
+    by:
+        Whether steps stand first in the sentence, or the axis of `scores`.
     adjusted:
         Whether verdict and p are a board's, adjusted for all of its pairs.
     whole:
         Environment steps at which the task's first board ranks.
-    score_name:
-        Name of the final score: `score`, or the metric's name.
     before:
         The side of a threshold where a run has not reached it: `below`, or `above`.
     provisional:
@@ -98,17 +104,17 @@ class PairVerdict:
     labels: tuple[str, str]
     times: TimesPair
     thresholds: tuple[str, ...]
-    scores: ScoreBoard | None
-    n_last: int
+    scores: ScoreSection | None
+    places: tuple[int, int] = (0, 1)
+    by: str = "steps"
     adjusted: bool = False
     whole: int = 0
-    score_name: str = "score"
     before: str = "below"
     provisional: bool = False
 
     @property
     def sentence(self) -> str:
-        """The verdict, its size and how sure it is; if seeds are missing or runs shorter than asked, it begins so."""
+        """The verdict by steps, then by final score; if seeds are missing or runs shorter than asked, it begins so."""
         said = self.said
         if self.times.horizon < self.whole:
             said = f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {said}"
@@ -117,6 +123,16 @@ class PairVerdict:
     @property
     def said(self) -> str:
         """The same without its beginning, for a list that has said it."""
+        clauses = [self._by_steps]
+        if self.scores is not None and self.by == "steps":
+            clauses.append(self.scores.clause(self.places, self.adjusted))
+        elif self.scores is not None:
+            clauses.insert(0, self.scores.verdict(self.labels))
+        return "; ".join([*clauses, *self._cautions])
+
+    @property
+    def _by_steps(self) -> str:
+        """The verdict by steps."""
         pair = self.times
         if (pair.at_cap == 1).all():
             return (
@@ -133,7 +149,7 @@ class PairVerdict:
 
     @property
     def _decided(self) -> str:
-        """Say how many steps more or fewer the first entry needs, and what so few seeds cannot know."""
+        """Say how many steps more or fewer the first entry needs."""
         first, second = self.labels
         value, low, high = fewer(self.times.difference)
         least, most = sorted((abs(low), abs(high)))
@@ -144,7 +160,7 @@ class PairVerdict:
         )
         return (
             f"{first} needs {_fewer_or_more(value)} steps than {second} ({ends}, {self._seeds}, {self._p})"
-            f"{self._crossing}{self._caution}"
+            f"{self._crossing}"
         )
 
     @property
@@ -156,9 +172,11 @@ class PairVerdict:
         return f", but {other} needs fewer at {', '.join(against)}" if against else ""
 
     @property
-    def _caution(self) -> str:
+    def _cautions(self) -> list[str]:
         """Say where the rule is measured to err in more than 7.5 percent."""
         pair, clauses = self.times, list[str]()
+        if pair.direction not in _DECIDED:
+            return clauses
         unseen = [n for n, failed in zip(pair.n_runs, pair.failed) if not failed and n < _UNSEEN]
         if unseen:
             clauses.append(
@@ -168,7 +186,7 @@ class PairVerdict:
         if more and any(more >= factor * less and min(pair.n_runs) <= most for factor, most in _SPREADS):
             times = f" {more / less:.0f} times as much as the other's" if less else " and the other's do not"
             clauses.append(f"one entry's seeds vary{times}, which so few seeds can mistake for a difference")
-        return "".join(f"; {clause}" for clause in clauses)
+        return clauses
 
     @property
     def _detectable(self) -> str:
@@ -225,31 +243,19 @@ class PairVerdict:
     @property
     def notes(self) -> list[str]:
         """The notes below the table."""
-        return [
+        notes = [
             f"steps {self.before} threshold: mean over seeds; a seed that never reaches it counts with "
             f"{steps_text(self.times.horizon)}",
             "difference: of the first entry against the second; p and intervals: for all thresholds together",
         ]
-
-    @property
-    def final(self) -> str:
-        """Both final scores, and their difference; empty where one entry has a single run."""
-        if self.scores is None:
-            return ""
-        low, high = self.scores.difference_interval[0, 1]
-        one, other = self.scores.mean
-        digits = ".3f" if max(abs(one), abs(other)) >= 0.001 else ".3g"
-        means = f"{one:{digits}} against {other:{digits}}"
-        p = "" if self.times.direction is Direction.UNDECIDED else f", {said(float(self.scores.p[0, 1]))}"
-        return (
-            f"final {self.score_name}: {means}, difference {_signed(self.scores.difference[0, 1])} "
-            f"({_signed(low)} to {_signed(high)}{p}); mean over the last tenth of the epochs ({self.n_last})"
-        )
+        if self.scores is not None:
+            ends = interval_text(_signed, *self.scores.difference(self.places))
+            notes.append(f"{self.scores.meaning}; difference {ends}")
+        return notes
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
         pair = self.times
-        scores = self.scores
         return {
             "n_runs": list(pair.n_runs),
             "verdict": str(pair.direction),
@@ -269,34 +275,50 @@ class PairVerdict:
                 }
                 for place, threshold in enumerate(self.thresholds)
             ],
-            "final_score": None
-            if scores is None
-            else {
-                "means": scores.mean.tolist(),
-                "difference": float(scores.difference[0, 1]),
-                "difference_interval": scores.difference_interval[0, 1].tolist(),
-                "p": float(scores.p[0, 1]),
-                "last_epochs": self.n_last,
-            },
+            "final_score" if self.by in ("steps", "score") else self.by: self._number_as_dict(),
+        }
+
+    def _number_as_dict(self) -> dict[str, Any] | None:
+        if self.scores is None:
+            return None
+        value, *interval = self.scores.difference(self.places)
+        return {
+            "means": self.scores.results.mean[[*self.places]].tolist(),
+            "difference": value,
+            "difference_interval": interval,
+            "p": float(self.scores.results.p[self.places]),
+            "last_epochs": self.scores.n_last,
         }
 
 
-def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: float) -> PairVerdict:
-    """Compare two entries of one task by times below threshold and by final scores, with all their seeds."""
+def judge_pair(
+    first: EntryResults,
+    second: EntryResults,
+    grid: Grid,
+    alpha: float,
+    by: str = "steps",
+    horizon: int | None = None,
+) -> PairVerdict:
+    """Compare two entries of one task by steps below threshold and by one more number, with all their seeds.
+
+    Parameters
+    ----------
+    by:
+        As for a board: the number that stands first in the sentence. With `steps`, final scores follow.
+    horizon:
+        Environment steps at which both are cut; None means the shorter one's.
+    """
     one, other = (LearningCurves(each.curves, each.steps_per_epoch, each.name) for each in (first, second))
-    end = common_horizon(one, other)
-    cut = [side.cut(end) for side in (one, other)]
-    several = min(side.n_runs for side in cut) > 1
+    times = times_pair(one, other, grid, alpha, horizon, seconds=_SECONDS)
+    number = "score" if by == "steps" else by
+    several = min(times.n_runs) > 1
     return PairVerdict(
         labels=_short(first, second),
-        times=times_pair(one, other, grid, alpha, seconds=_SECONDS),
+        times=times,
         thresholds=tuple(f"{threshold:g}" for threshold in grid.thresholds),
-        scores=compare_scores({str(k): final_scores(side) for k, side in enumerate(cut)}, alpha)
-        if several
-        else None,
-        n_last=last_epochs(cut[0].values.shape[1]),
+        scores=scores.compared([first, second], times.horizon, number, alpha) if several else None,
+        by=by,
         whole=min(ranking_of([first, second]).horizons),
-        score_name=first.task_file.score.called,
         before=grid.before,
         provisional=bool(first.missing or second.missing),
     )
@@ -310,7 +332,7 @@ def _short(first: EntryResults, second: EntryResults) -> tuple[str, str]:
 
 
 def on_board(
-    first: EntryResults, second: EntryResults, entries: Sequence[EntryResults], grid: Grid, alpha: float
+    first: EntryResults, second: EntryResults, entries: Sequence[EntryResults], alpha: float
 ) -> OnBoard | None:
     """Return the pair's verdict on its task's board, at the pair's horizon.
 
@@ -338,18 +360,25 @@ def on_board(
     if len(ranked) < 3 or not set(pair) <= set(places):
         return None
     curves = [LearningCurves(each.curves, each.steps_per_epoch, str(k)) for k, each in enumerate(ranked)]
-    board = times_board(curves, grid, alpha, end)
+    board = times_board(curves, ranking_of([first, second]).grid, alpha, end)
     i, j = map(places.index, pair)
     return OnBoard(len(ranked), float(board.adjusted[i, j]), board.directions[i][j])
 
 
 def pair_on(
-    ranking: TimeRanking, first: TimeRow, second: TimeRow, grid: Grid, labels: tuple[str, str]
+    ranking: TimeRanking,
+    finals: ScoreSection | None,
+    first: TimeRow,
+    second: TimeRow,
+    grid: Grid,
+    labels: tuple[str, str],
 ) -> PairVerdict:
     """Return the board's verdict on two of its rows; of entries that it does not rank the pair's own.
 
     Parameters
     ----------
+    finals:
+        The board's ranked entries by final score; None if it ranks none.
     grid:
         The grid of the board.
     labels:
@@ -358,16 +387,11 @@ def pair_on(
     board = ranking.board
     rows = first, second
     i, j = (ranking.order[ranking.rows.index(row)] for row in rows)
+    if finals is None or board.directions[i][j] is Direction.UNDECIDED:
+        alone = judge_pair(first.entry, second.entry, grid, board.alpha, horizon=board.horizon)
+        return replace(alone, labels=labels)
     each = np.full(len(grid.levels), np.nan)
-    thresholds = tuple(f"{threshold:g}" for threshold in grid.thresholds)
-    whole = min(ranking_of([row.entry for row in rows]).horizons)
-    if board.directions[i][j] is Direction.UNDECIDED:
-        one, other = (LearningCurves(r.entry.curves, r.entry.steps_per_epoch, r.entry.name) for r in rows)
-        alone = times_pair(one, other, grid, board.alpha, board.horizon, seconds=_SECONDS)
-        missing = any(row.entry.missing for row in rows)
-        return PairVerdict(
-            labels, alone, thresholds, None, 0, whole=whole, before=grid.before, provisional=missing
-        )
+    names = [entry.name for entry in finals.entries]
     times = TimesPair(
         n_runs=(board.n_runs[i], board.n_runs[j]),
         horizon=board.horizon,
@@ -385,7 +409,16 @@ def pair_on(
         differences=np.stack([each, each, each], axis=1),
         at_cap=np.stack([row.mean.at_cap for row in rows]),
     )
-    return PairVerdict(labels, times, thresholds, None, 0, adjusted=True, whole=whole, before=grid.before)
+    return PairVerdict(
+        labels,
+        times,
+        tuple(f"{threshold:g}" for threshold in grid.thresholds),
+        finals,
+        (names.index(first.entry.name), names.index(second.entry.name)),
+        adjusted=True,
+        whole=min(ranking_of([row.entry for row in rows]).horizons),
+        before=grid.before,
+    )
 
 
 def fewer(difference: FloatArray) -> tuple[float, float, float]:
@@ -426,13 +459,8 @@ def _difference(values: FloatArray) -> str:
 
 def _signed(value: float) -> str:
     """Write a difference of scores, from 10 up without a power of ten: `+0.012`, `-3.4`, `+12.5`, `+130`."""
+    value = round(value, 12)  # rounding leaves no power of ten
     return f"{value:+.0f}" if abs(value) >= 100 else f"{value:+.1f}" if abs(value) >= 10 else f"{value:+.2g}"
-
-
-def said(p: float) -> str:
-    """Write a p value in a sentence: `p = .021`, `p < .0001`; empty where there is none."""
-    text = p_text(p)
-    return text and (f"p < {text[1:]}" if text[0] == "<" else f"p = {text}")
 
 
 def _number(value: float) -> float | None:

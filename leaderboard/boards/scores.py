@@ -1,9 +1,9 @@
-"""A task's entries by how well they do: by their final scores, the area under their curves, or a metric at the end."""
+"""A task's entries by one number per seed: final score, area under the curve, spread, or a metric at the end."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,21 +15,32 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import steps, tables
 from qrlsuite.leaderboard.boards.columns import estimate, ranks_column
+from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.results.text import interval_text, score_text, steps_text
+from qrlsuite.results.text import interval_text, mean_text, said, score_text, steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
     AcrossTasks,
+    Grid,
     LearningCurves,
     ScoreBoard,
     areas,
     compare_scores,
+    deviations,
     final_scores,
     last_epochs,
     rank_ranges,
 )
+from qrlsuite.statistics.grid import FloatArray
+from qrlsuite.statistics.pair import can_decide
 
-OF_RUNS = {"score": final_scores, "area": areas}
+Pair = tuple[int, int]
+"""Places of two entries in a section."""
+OF_RUNS: Mapping[str, Callable[[LearningCurves, Grid], FloatArray]] = {
+    "score": lambda curves, _: final_scores(curves),
+    "area": lambda curves, _: areas(curves),
+    "spread": deviations,
+}
 """Numbers of each run that rank entries. Metrics in a task's `[ranking] costs` rank, too, by their final value."""
 
 
@@ -40,8 +51,8 @@ class ScoreSection:
     Attributes
     ----------
     task, horizon, by, alpha:
-        The task; the environment steps at which all curves are cut; `score`, `area` or a metric; and the error for all
-        pairs together.
+        The task; the environment steps at which all curves are cut; `score`, `area`, `spread` or a metric; and the
+        error for all pairs together.
     entries:
         The ranked entries, in the order of `results`.
     results:
@@ -71,10 +82,25 @@ class ScoreSection:
     sign: int = 1
 
     @property
+    def called(self) -> str:
+        """The number's name in sentences."""
+        names = {"area": "area under the learning curve", "spread": "spread between seeds"}
+        return names.get(self.by, f"final {self.of}")
+
+    @property
+    def meaning(self) -> str:
+        """What the number is."""
+        match self.by:
+            case "area":
+                return f"area: mean {self.of} over all epochs"
+            case "spread":
+                return "spread: how far a seed's steps are from those of the median seed, mean over seeds"
+        return f"final {self.of}: mean over the last tenth of the epochs ({self.n_last})"
+
+    @property
     def title(self) -> str:
         """The title: task, horizon and number."""
-        what = "area under the learning curve" if self.by == "area" else f"final {self.of}"
-        return f"{self.task}, {steps_text(self.horizon)} steps, by {what}"
+        return f"{self.task}, {steps_text(self.horizon)} steps, by {self.called}"
 
     @property
     def order(self) -> tuple[int, ...]:
@@ -85,12 +111,12 @@ class ScoreSection:
     def columns(self) -> tuple[Column[int], ...]:
         """Return the columns; a row is a place of the order."""
         results, order, more = self.results, self.order, self.sign > 0
-        level = f"{100 * (1 - self.alpha):g}%"
+        level, write = f"{100 * (1 - self.alpha):g}%", mean_text if self.by == "spread" else score_text
 
         def ahead(place: int) -> str:
             first, index = order[0], order[place]
             difference = results.difference[first, index], *results.difference_interval[first, index]
-            return interval_text(score_text, *self._turned(*difference)) if place else "-"
+            return interval_text(write, *self._turned(*difference)) if place else "-"
 
         def better(place: int) -> float | None:
             return self._better(*order[place : place + 2]) if place + 1 < len(order) else None
@@ -105,7 +131,7 @@ class ScoreSection:
             ),
             Column("label", lambda place: self.entries[order[place]].label),
             Column("seeds", lambda place: len(self.entries[order[place]].seeds), str),
-            *means(results, order, level),
+            *means(results, order, level, write),
             Column("", ahead, head="below the first" if more else "above the first", cell=ahead),
             Column("", better, "{:.2f}".format, head=f"P({'more' if more else 'less'} than next)"),
         )
@@ -127,14 +153,8 @@ class ScoreSection:
     def notes(self) -> list[str]:
         """Explain the columns."""
         size, better = len(self.entries), self.results.better
-        what = (
-            f"area: mean {self.of} over all epochs"
-            if self.by == "area"
-            else f"final {self.of}: mean over the last tenth of the epochs ({self.n_last}): "
-            "one validation alone is noisy"
-        )
         lines = [
-            what,
+            self.meaning,
             f"rank: what the significant pairs leave ({int((better == 1).sum())} of {size * (size - 1) // 2}: "
             f"permutation test, Holm, error {self.alpha:g} for all pairs together)",
             "IQM: mean of the middle half of the seeds; intervals: bootstrap of the seeds, of each entry by itself",
@@ -149,6 +169,35 @@ class ScoreSection:
             *([f"fewer than {MIN_RUNS} seeds: {', '.join(few)}"] if few else []),
             *tables.remarks(self.entries),
         ]
+
+    def difference(self, pair: Pair) -> tuple[float, float, float]:
+        """Return the first's mean minus the second's, and its interval."""
+        low, high = self.results.difference_interval[pair].tolist()
+        return float(self.results.difference[pair]), low, high
+
+    def clause(self, pair: Pair, adjusted: bool = False, named: bool = True) -> str:
+        """Return `final score 0.942 against 0.791, p = .002`; without p where there are too few seeds for one."""
+        one, other = self.results.mean[[*pair]].tolist()
+        digits = ".3f" if max(abs(one), abs(other)) >= 0.001 else ".3g"
+        write = mean_text if self.by == "spread" else f"{{:{digits}}}".format
+        p = float((self.results.adjusted if adjusted else self.results.p)[pair])
+        known = f", {'adjusted ' * adjusted}{said(p)}" * self._decidable(pair)
+        return f"{f'{self.called} ' * named}{write(one)} against {write(other)}{known}"
+
+    def verdict(self, labels: tuple[str, str]) -> str:
+        """Say which of two entries has more; `labels` are their names in the sentence."""
+        if not self._decidable((0, 1)):
+            return f"cannot be decided with so few seeds: {self.clause((0, 1))}"
+        if self.results.p[0, 1] > self.alpha:
+            return f"not told apart: {self.clause((0, 1))}"
+        more = "higher" if self.results.difference[0, 1] > 0 else "lower"
+        return f"{labels[0]} has a {more} {self.called} than {labels[1]} ({self.clause((0, 1), named=False)})"
+
+    def _decidable(self, pair: Pair) -> bool:
+        """Tell whether p of a pair may be trusted: that of spreads from 20 seeds on, see docs/error-rates.md."""
+        one, other = (len(self.entries[place].seeds) for place in pair)
+        enough = min(one, other) >= MIN_RUNS if self.by == "spread" else True
+        return enough and can_decide(one, other, self.alpha)
 
     def sheet(self, explain: bool = False) -> Sheet:
         """Return the table; `explain` adds all its notes."""
@@ -176,7 +225,7 @@ class ScoreSection:
             "task": self.task,
             "horizon": self.horizon,
             "by": self.by,
-            "last_epochs": None if self.by == "area" else self.n_last,
+            "last_epochs": None if self.by in ("area", "spread") else self.n_last,
             "alpha": self.alpha,
             "entries": [record(self.columns(), place) for place in range(len(order))],
             "improvement": results.improvement[square].tolist(),
@@ -190,7 +239,12 @@ class ScoreSection:
         }
 
 
-def means(results: ScoreBoard | AcrossTasks, order: Sequence[int], level: str) -> tuple[Column[int], ...]:
+def means(
+    results: ScoreBoard | AcrossTasks,
+    order: Sequence[int],
+    level: str,
+    write: Callable[[float], str] = score_text,
+) -> tuple[Column[int], ...]:
     """Return the columns of the mean and the interquartile mean; a row is a place of the order."""
 
     def read(values: Any, ends: Any) -> Callable[[int], Sequence[float]]:
@@ -199,8 +253,8 @@ def means(results: ScoreBoard | AcrossTasks, order: Sequence[int], level: str) -
     mean = read(results.mean, results.mean_interval)
     middle = read(results.interquartile_mean, results.interquartile_interval)
     return (
-        *estimate("mean", "mean_interval", mean, score_text, head=f"mean ({level})"),
-        *estimate("interquartile_mean", "interquartile_interval", middle, score_text, head=f"IQM ({level})"),
+        *estimate("mean", "mean_interval", mean, write, head=f"mean ({level})"),
+        *estimate("interquartile_mean", "interquartile_interval", middle, write, head=f"IQM ({level})"),
     )
 
 
@@ -216,35 +270,51 @@ def rank_by_score(
     horizon:
         Environment steps at which all are cut.
     by:
-        `score`, the mean over the last tenth of the epochs; `area`, the mean over all; or a cost: less is better.
+        `score`, the mean over the last tenth of the epochs; `area`, the mean over all; `spread`, see
+        `qrlsuite.statistics.deviations`; or a cost. Of the last two, less is better.
     alpha:
         In (0, 1): probability of any false difference among entries of equal laws.
     """
-    score, costs = entries[0].task_file.score, entries[0].task_file.ranking.costs
-    if by not in OF_RUNS and by not in costs:
-        raise OptionError(f"--by {by}: expected {' or '.join([*OF_RUNS, *costs])}")
     ranked = tuple(entry for entry in entries if len(entry.seeds) >= MIN_RUNS and not entry.missing)
     if not ranked:
         lines = tables.missing(entries) or [f"no entry has {MIN_RUNS} seeds"]
         raise OptionError(f"--by {by}: {'; '.join(lines)}")
-    values = [each.curves if by in OF_RUNS else _measured(each, by) for each in ranked]
+    return replace(
+        compared(ranked, horizon, by, alpha),
+        unranked=tuple(entry for entry in entries if entry not in ranked),
+    )
+
+
+def compared(entries: Sequence[EntryResults], horizon: int, by: str, alpha: float) -> ScoreSection:
+    """Compare all entries by one number per seed; arguments as for `rank_by_score`."""
+    score, costs = entries[0].task_file.score, entries[0].task_file.ranking.costs
+    if by not in OF_RUNS and by not in costs:
+        raise OptionError(f"--by {by}: expected {' or '.join([*OF_RUNS, *costs])}")
+    values = [each.curves if by in OF_RUNS else _measured(each, by) for each in entries]
     curves = [
         LearningCurves(of_runs, each.steps_per_epoch, each.label).cut(horizon)
-        for of_runs, each in zip(values, ranked)
+        for of_runs, each in zip(values, entries)
     ]
-    number = OF_RUNS.get(by, final_scores)
+    number, grid = OF_RUNS.get(by, OF_RUNS["score"]), ranking_of(entries).grid
     return ScoreSection(
-        task=ranked[0].task,
+        task=entries[0].task,
         horizon=horizon,
         by=by,
         alpha=alpha,
-        entries=ranked,
-        results=compare_scores({str(k): number(each) for k, each in enumerate(curves)}, alpha),
+        entries=tuple(entries),
+        results=compare_scores({str(k): number(each, grid) for k, each in enumerate(curves)}, alpha),
         n_last=last_epochs(curves[0].values.shape[1]),
-        unranked=tuple(entry for entry in entries if entry not in ranked),
+        unranked=(),
         of=score.called if by in OF_RUNS else by,
-        sign=score.sign if by in OF_RUNS else -1,
+        sign=score.sign if by in ("score", "area") else -1,
     )
+
+
+def finals(section: steps.Section) -> ScoreSection | None:
+    """Return all ranked entries of a board by final score, shown or not; None if it ranks none."""
+    board = section.times.board
+    ranked = [entry for entry, ranks in zip(section.entries, board.ranks, strict=True) if ranks[0]]
+    return compared(ranked, section.horizon, "score", board.alpha) if ranked else None
 
 
 def _measured(entry: EntryResults, name: str) -> NDArray[np.float64]:

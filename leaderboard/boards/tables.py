@@ -23,6 +23,7 @@ from qrlsuite.results.text import (
 )
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import MIN_RUNS, TOO_FEW
+from qrlsuite.statistics.curves import reached
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.boards.steps import Section
@@ -77,7 +78,7 @@ def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
             lines.append(
                 f"shorter: {row.entry.label}, {counted(len(row.entry.seeds), 'seed')}, {steps_text(section.horizon)} "
                 f"steps, {interval_text(mean_text, mean.mean, *mean.interval)} of them {section.before} threshold"
-                + f"; diverged: {_of_seeds(row.entry)}"
+                + f"; diverged: {_of_seeds(row.entry, len(row.entry.diverged))}"
                 * bool(row.entry.diverged)
             )
     others = [each for each in sections if each is not main]
@@ -124,7 +125,7 @@ def notes(section: Section, by_tiers: bool, special: Sequence[str] = ()) -> list
     entries = [row.entry for row in section.rows]
     promise = [f"rule '{section.rule}': {section.promise}"] * by_tiers
     marks = _marks(section)
-    return [first, *doubts(entries), *_never(section), *others, *marks, *special, *promise, *remarks(entries)]
+    return [first, *doubts(entries, section.horizon), *others, *marks, *special, *promise, *remarks(entries)]
 
 
 def title(section: Section) -> str:
@@ -183,24 +184,17 @@ def _marks(section: Section) -> list[str]:
     return ["; ".join(marks)] * bool(marks)
 
 
-def _never(section: Section) -> list[str]:
-    """Name the ranked entries that stay below every threshold, and the axis that ranks them nevertheless."""
-    found = [row for row in section.rows if row.time.at_cap == 1 and row.time.ranks is not None]
-    told = ", ".join(name for name in columns.names([row.entry for row in found]))
-    line = (
-        f"no seed reached a threshold, so steps do not tell them apart: {told}. --by area ranks by the learning "
-        "curves alone"
-    )
-    return [line] * (len(found) > 1)
+def _of_seeds(entry: EntryResults, count: int) -> str:
+    return f"{count} of {len(entry.seeds)} seeds"
 
 
-def _of_seeds(entry: EntryResults) -> str:
-    return f"{len(entry.diverged)} of {len(entry.seeds)} seeds"
+def about(entries: Sequence[EntryResults]) -> list[str]:
+    """Return the notes below every verdict: those that may turn it, then how settings were found and what trained."""
+    return [*doubts(entries), *remarks(entries)]
 
 
 def remarks(entries: Sequence[EntryResults]) -> list[str]:
-    """Return further notes on entries, below every table and verdict: how they were tuned, and what made them."""
-    tuned = {entry.label: _tuning_text(entry.tuning, entry.preset) for entry in entries if entry.tuning}
+    """Return further notes on entries: how their settings were found, and what made them."""
     notes = {
         "parameters of the first network alone (older records count no other, such as a critic)": {
             entry.label: "" for entry in entries if entry.first_network_alone
@@ -209,7 +203,6 @@ def remarks(entries: Sequence[EntryResults]) -> list[str]:
         "not installed here, so judged from the stored curves": {
             name: "" for entry in entries for name in absent(entry)
         },
-        "settings found by tuning": tuned,
         "made with several versions, see `qrlsuite show ENTRY`": {
             entry.label: ", ".join(entry.mixed_versions) for entry in entries if entry.mixed_versions
         },
@@ -220,11 +213,20 @@ def remarks(entries: Sequence[EntryResults]) -> list[str]:
             entry.label: ", ".join(entry.devices) for entry in entries if len(entry.devices) > 1
         },
     }
-    return [*_unequal_tuning(entries), *_listed(notes)]
+    return [*_settings(entries), *_listed(notes)]
 
 
-def doubts(entries: Sequence[EntryResults]) -> list[str]:
-    """Return the notes on entries that may turn a verdict: these stand first."""
+def doubts(entries: Sequence[EntryResults], horizon: int | None = None) -> list[str]:
+    """Return the notes on entries that may turn a verdict: these stand first.
+
+    Parameters
+    ----------
+    horizon:
+        Environment steps at which all are judged; None means the shortest one's.
+    """
+    failed = _failed(entries, horizon)
+    nowhere = sum(len(entry.seeds) == failed[entry.label] for entry in entries) > 1
+    by_area = "; `--by area` ranks by the learning curves alone" * nowhere
     notes = {
         "curves that other programs made, and nobody here can train or check again": {
             entry.label: entry.ended_early
@@ -242,8 +244,11 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
         "seeds have in common by declaration": {
             entry.label: "; ".join(entry.declared) for entry in entries if entry.declared
         },
+        f"failed (reached no threshold{by_area})": {
+            entry.label: _of_seeds(entry, failed[entry.label]) for entry in entries if failed[entry.label]
+        },
         "diverged (numbers of the agents are no longer finite), judged with the scores that they had": {
-            entry.label: _of_seeds(entry) for entry in entries if entry.diverged
+            entry.label: _of_seeds(entry, len(entry.diverged)) for entry in entries if entry.diverged
         },
         **{
             sentence: {entry.label: "" for entry in entries if sentence in entry.unusable}
@@ -256,6 +261,16 @@ def doubts(entries: Sequence[EntryResults]) -> list[str]:
         },
     }
     return [*missing(entries), *_listed(notes), *_edited(entries), *changed_thresholds(entries)]
+
+
+def _failed(entries: Sequence[EntryResults], horizon: int | None) -> dict[str, int]:
+    """Return how many seeds of each entry reach no threshold, by label."""
+    if not entries:
+        return {}
+    grid = ranking_of(entries).grid
+    end = horizon or min(entry.curves.shape[1] * entry.steps_per_epoch for entry in entries)
+    curves = {entry.label: entry.curves[:, : end // entry.steps_per_epoch] for entry in entries}
+    return {label: int((~reached(each, grid).any(axis=(0, 1))).sum()) for label, each in curves.items()}
 
 
 def missing(entries: Sequence[EntryResults]) -> list[str]:
@@ -315,28 +330,31 @@ def _edited(entries: Sequence[EntryResults]) -> list[str]:
     return lines
 
 
-def _unequal_tuning(entries: Sequence[EntryResults]) -> list[str]:
-    """Return notes on entries that are judged against each other, but were tuned unequally."""
+def _settings(entries: Sequence[EntryResults]) -> list[str]:
+    """Return how the settings of entries were found, and whether they were found alike."""
+    found: dict[str, list[str]] = {}
+    for entry in entries:
+        found.setdefault(_settings_text(entry), []).append(entry.label)
+    texts = [text if len(found) == 1 else f"{text}: {', '.join(labels)}" for text, labels in found.items()]
+    lines = [f"settings: {'; '.join(texts)}"] if texts else []
     tuned = [entry.tuning for entry in entries if entry.tuning]
-    budgets = {record.get("budget") for record in tuned}
-    lines = []
     if 0 < len(tuned) < len(entries):
         lines.append("tuned and untuned settings are compared: a difference may be one of tuning")
+    budgets = {record.get("budget") for record in tuned}
     if len(budgets) > 1:
         texts = sorted("not known" if budget is None else str(budget) for budget in budgets)
         lines.append(f"tuned with different budgets: {'; '.join(texts)}")
     return lines
 
 
-def _tuning_text(tuning: Mapping[str, Any], preset: str | None) -> str:
-    """Return the known budget of an entry's tuning: `7 trials, 0.12 core-hours`.
-
-    A preset's own note comes first: the settings may have been found for another size of the model.
-    """
-    units = {"trials": "trials", "steps": "steps", "core_hours": "core-hours"}
-    known = [f"{tuning[name]:,} {unit}" for name, unit in units.items() if tuning.get(name) is not None]
-    text = ", ".join(known) or "budget not known"
-    return f"preset '{preset}', {tuning['note']}: {text}" if preset and tuning.get("note") else text
+def _settings_text(entry: EntryResults) -> str:
+    """Say how an entry's settings were found: `released, not tuned`, or by which search, with its regret and budget."""
+    if entry.tuning is None:
+        return "how they were found is not known" if entry.external else f"{entry.settings}, not tuned"
+    search, note = entry.tuning.get("sampler"), entry.tuning.get("note") or ""
+    doubts = note.partition("; ")[2] if entry.tuning.get("regret") else note  # it begins with the regret
+    flatters = MARKS["†"] * entry.on_protocol_seeds
+    return ", ".join(filter(None, [entry.settings, search and f"search: {search}", flatters, doubts]))
 
 
 SIGNS = {Direction.FEWER: "+", Direction.MORE: "-"}

@@ -14,6 +14,7 @@ from qrlsuite.studies.state import (
     TURNED,
     State,
     difference_text,
+    finals_text,
     horizon_note,
     lost_note,
     needs_text,
@@ -38,14 +39,15 @@ def view(state: State) -> dict[str, Any]:
         difference, interval = (text.replace("-", "−") for text in difference_text(pair, study.grid))
         needs = needs_text(state, each["needs"]).replace("<=", "≤")
         names = {"question": clean(each["question"] or "", 300), "pair": clean(versus(pair))}
-        row = {"verdict": clean(state.verdict(pair)), "seeds": pair.n_runs, "needs": needs}
+        finals = f"final score {finals_text(state, pair)}" * bool(pair.p)
+        row = {"finals": finals, "verdict": clean(state.verdict(pair)), "seeds": pair.n_runs, "needs": needs}
         pairs.append({**names, **row, "difference": difference, "interval": interval})
-    notes = reason_note(study), lost_note(state), horizon_note(state), TURNED.get(study.hash)
+    notes = reason_note(study), lost_note(state), horizon_note(state), TURNED.get(study.hash), *state.notes
     return {
         "name": clean(study.name),
         "question": clean(study.file.summary, 300),
         "facts": [(term, clean(value, 600)) for term, value in _facts(state, facts)],
-        "note": ". ".join(clean(note, 600) for note in notes if note),
+        "note": ". ".join(clean(note, 3000) for note in notes if note),
         "pairs": pairs,
         "looks": [_look(state, index) for index in range(len(study.design.looks))],
         "picture": _picture(state),

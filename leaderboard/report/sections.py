@@ -11,7 +11,7 @@ import numpy as np
 
 from qrlsuite.columns import Column
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.boards import columns, tables
+from qrlsuite.leaderboard.boards import columns, scores, tables
 from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.boards.ranked import ranking_of, unranked_since
 from qrlsuite.leaderboard.boards.steps import Section
@@ -25,7 +25,7 @@ from qrlsuite.leaderboard.report.rows import RowView
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.winners import Winners, winners
 from qrlsuite.results.text import counted, hours_text, p_text, steps_text
-from qrlsuite.statistics import Direction, Evidence, Grid, Outcome
+from qrlsuite.statistics import Direction, Evidence, Outcome
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
@@ -100,7 +100,15 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
     surfaces = tuple(surface(judgement.own(place), ranking) for place in range(len(rows)))
     winning = winners(rows, section.times)
-    asked = winning.asked(rows)
+    asked, finals = winning.asked(rows), scores.finals(section)
+
+    def verdict(one: RowView, other: RowView, kinds: bool = False) -> str:
+        """Return the board's verdict on two rows in a sentence; `kinds` says which is classical and which quantum."""
+        kinds = kinds and {one.kind, other.kind} == {"classical", "quantum"}
+        first, second = (f"{row.kind} {row.name}" if kinds else row.name for row in (one, other))
+        said = pair_on(section.times, finals, one.time, other.time, grid, (first, second)).sentence
+        return f"{said}.".replace("p = ", "p\u00a0=\u00a0").replace("p < ", "p\u00a0<\u00a0")
+
     picked = sorted({row.place for pair in asked for row in pair} or {row.place for row in rows[:3]})
     for place in picked:  # the first colors differ most
         _ = rows[place].entry.color
@@ -113,13 +121,12 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         changed=clean(", ".join(changed_options(section.rows[0].entry) or ())),
         algorithm=algorithm,
         lead=_lead(rows, section.times),
-        answers=tuple(_verdict(section, grid, *pair, kinds=len(asked) < 3) for pair in asked),
+        answers=tuple(verdict(*pair, kinds=len(asked) < 3) for pair in asked),
         winners=winning,
         citation=cite(section, rows),
         picked=tuple(picked),
         sentences=tuple(
-            (one.place, other.place, _verdict(section, grid, one, other))
-            for one, other in itertools.combinations(rows, 2)
+            (one.place, other.place, verdict(one, other)) for one, other in itertools.combinations(rows, 2)
         ),
         rows=rows,
         columns=tuple(
@@ -159,14 +166,6 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
             tuple(_decision_cell(section.times, i, j) for j in order.tolist()) for i in order.tolist()
         ),
     )
-
-
-def _verdict(section: Section, grid: Grid, one: RowView, other: RowView, kinds: bool = False) -> str:
-    """Return the board's verdict on two rows in a sentence; `kinds` says which is classical and which quantum."""
-    kinds = kinds and {one.kind, other.kind} == {"classical", "quantum"}
-    first, second = (f"{row.kind} {row.name}" if kinds else row.name for row in (one, other))
-    said = pair_on(section.times, one.time, other.time, grid, (first, second)).sentence
-    return f"{said}.".replace("p = ", "p\u00a0=\u00a0").replace("p < ", "p\u00a0<\u00a0")
 
 
 def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:

@@ -10,11 +10,14 @@ Verdicts are not stored: they are computed from the study and the curves.
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from qrlsuite.leaderboard.boards import tables
 from qrlsuite.leaderboard.shelf import PLANS, collect, import_seeds, published
 from qrlsuite.leaderboard.shelf.collect import Selection
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export as export_entry
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.results.store import EntryStore, write_atomically
@@ -80,6 +83,19 @@ def read(folder: Path, labels: bool = True) -> State:
     return study.state(trained, hours, begun=True)
 
 
+def noted(state: State) -> State:
+    """Return a study's state with the notes on its entries that stand below every verdict."""
+    entries, notes = list[EntryResults](), list[str]()
+    for name, entry in state.study.entries.items():
+        try:
+            found = collect.read(EntryStore.find(state.study.folder, entry)) if state.seeds[name] else None
+        except StoreError as error:
+            notes.append(str(error))
+        else:  # `lost` says what is missing
+            entries += [replace(found, own_label=name, asked={})] if found is not None else []
+    return replace(state, notes=(*notes, *tables.about(entries)))
+
+
 def collected(selection: Selection) -> tuple[list[State], list[str]]:
     """Return the outcomes of the selection's studies with looks, and a line for each unreadable study.
 
@@ -96,7 +112,7 @@ def collected(selection: Selection) -> tuple[list[State], list[str]]:
             continue
         if outcome.study.hash not in known and (not tasks or outcome.study.task in tasks):
             outcomes.append(outcome)
-    return outcomes, refused
+    return [noted(outcome) for outcome in outcomes], refused
 
 
 def export(study: Study, out: Path, agents: bool = True) -> Path:

@@ -234,12 +234,12 @@ def compare(
     runs: str | PathLike[str] = "runs",
     published: bool = False,
     rule: str | None = None,
+    by: str = "steps",
     labels: Mapping[str, str] | Sequence[str] = (),
 ) -> EntryComparison:
-    """Compare two entries: which needs fewer steps, by how much and how surely.
+    """Compare two entries: which needs fewer steps, by how much and how surely, and their final scores.
 
-    All seeds of both count, up to the shorter horizon. In the cells of the task's ranking grid both are compared at
-    equal numbers of seeds.
+    All seeds of both count, up to the shorter horizon.
 
     Parameters
     ----------
@@ -248,7 +248,9 @@ def compare(
     task, runs, published:
         As for `load`.
     rule:
-        As for `board`: the rule for significance in a cell.
+        Judges the cells of the task's grid, too, at equal numbers of seeds: `paper`, or a name of `list rules`.
+    by:
+        What the sentence begins with: `steps`, `score`, `area`, `spread`, or a cost that the task names.
     labels:
         As for `board`.
 
@@ -256,9 +258,9 @@ def compare(
     -------
     EntryComparison
         `sentence`, the verdict, and its `p`, `difference` (-0.2: the first needs 20% fewer steps) and `interval`;
-        `pair`, with the numbers of each threshold and the final scores; `among`, the verdict on the board of all
-        entries of the task, where one of the two is given by name. Of the cells: `verdicts`, E rows of D; `points` of
-        shape (2, E, D) and `intervals` of shape (2, E, D, 2), in environment steps; `outcome`. `as_dict()` has all.
+        `pair`, with the numbers of each threshold and the final scores; `remarks`, on settings, seeds and versions;
+        `among`, the verdict on the board of all entries of the task, where one of the two is given by name; with a
+        rule `cells`, a `qrlsuite.statistics.Comparison`. `as_dict()` has all.
 
     Raises
     ------
@@ -270,8 +272,10 @@ def compare(
     Examples
     --------
     >>> found = compare("mlp width=64", "mlp width=16", task="beam6g", runs="none-yet", published=True)
-    >>> found.sentence
-    'mlp width=64 needs 53% fewer steps than mlp width=16 (49% to 56%, 100 seeds each, p < .0001)'
+    >>> for clause in found.sentence.split("; "):
+    ...     print(clause)
+    mlp width=64 needs 53% fewer steps than mlp width=16 (49% to 56%, 100 seeds each, p < .0001)
+    final score 0.909 against 0.860, p < .0001
     >>> round(found.difference, 2), found.p < 0.0002
     (-0.53, True)
     """
@@ -290,11 +294,11 @@ def compare(
                 raise error from None
 
     left, other = find(first, second), find(second, first)
-    compared = compare_entries(left, other, rules.load(rule) if rule else None)
+    compared = compare_entries(left, other, rules.load(rule) if rule else None, by)
     if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared
     others, left_out = collect.collect(selection.of(left.task))
-    among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
+    among = on_board(left, other, others, compared.pair.times.alpha)
     places = (f"of the same entry, from {left.folder}", f"of the same entry, from {other.folder}")
     codes = [f"than '{one.record.label}{end}" for one in (left, other) for end in ("'", " @")]
     copies = [

@@ -23,6 +23,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.experiment import identity
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards.times import ALPHA
+from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.options import from_mapping
 from qrlsuite.results.seeds import read_seeds
@@ -314,7 +315,9 @@ def take_looks(
 ) -> State:
     """Train a study with looks until all pairs are decided; print the verdicts of every look."""
     missing.check_budget(budget, where)
-    return study_runner.take_looks(Study(study, Path(runs)), where, budget, not progress)
+    return published_studies.noted(
+        study_runner.take_looks(Study(study, Path(runs)), where, budget, not progress)
+    )
 
 
 def require_unchanged(name: str, given: Mapping[str, object]) -> None:

@@ -54,6 +54,12 @@ def p_text(p: float) -> str:
     return f"{p:.2g}".replace("0.", ".") if p >= 0.001 else f"{p:.4f}".replace("0.", ".")
 
 
+def said(p: float) -> str:
+    """Write a p value in a sentence: `p = .021`, `p < .0001`; empty where there is none."""
+    text = p_text(p)
+    return text and (f"p < {text[1:]}" if text[0] == "<" else f"p = {text}")
+
+
 def score_text(score: float) -> str:
     """Write a score: 0.712."""
     return f"{round(score, 3) + 0.0:.3f}"  # no -0.000

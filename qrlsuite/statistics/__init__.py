@@ -35,7 +35,7 @@ from qrlsuite.statistics.estimator import (
     sample_complexity,
     unsettled,
 )
-from qrlsuite.statistics.final import ScoreBoard, areas, compare_scores, final_scores, last_epochs
+from qrlsuite.statistics.final import ScoreBoard, areas, compare_scores, deviations, final_scores, last_epochs
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.pair import TimesPair, times_pair
 from qrlsuite.statistics.permutation import MaxT, StepsRule, TimesRule
@@ -107,6 +107,7 @@ __all__ = [
     "compare_scores",
     "decide",
     "decision_rates",
+    "deviations",
     "final_scores",
     "holm",
     "horizon_shares",

@@ -1,8 +1,9 @@
-"""One score per run, more is better: how well it did at the end, and over all of its training.
+"""One number per run: how well it did at the end, over all of its training, and how far it is from the other runs.
 
 `final_scores` is the mean over the last tenth of the epochs: a single validation is noisy, and a tenth is short enough
 that learning has little part in it. `areas` is the area under the learning curve over the horizon: the mean over all
-epochs. `compare_scores` compares entries by either, with the aggregates of rliable (Agarwal et al. 2021).
+epochs. `deviations` are small where seeds are alike. `compare_scores` compares entries by one of them, with the
+aggregates of rliable (Agarwal et al. 2021).
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from numpy.typing import ArrayLike
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics.across import across_tasks
 from qrlsuite.statistics.curves import LearningCurves
-from qrlsuite.statistics.grid import FloatArray, IntArray
-from qrlsuite.statistics.times import check_probability, student_quantile
+from qrlsuite.statistics.grid import FloatArray, Grid, IntArray
+from qrlsuite.statistics.times import check_probability, student_quantile, times_below
 
 
 def last_epochs(n_epochs: int) -> int:
@@ -40,6 +41,16 @@ def areas(entry: LearningCurves) -> FloatArray:
     """Return, shape (N,): the area under each run's curve divided by the horizon, its mean score over all epochs."""
     scores: FloatArray = entry.values.mean(axis=1, dtype=np.float64)
     return scores
+
+
+def deviations(entry: LearningCurves, grid: Grid) -> FloatArray:
+    """Return, shape (N,): how far each run's mean steps below the thresholds are from those of the median run.
+
+    Their means are compared by the test of Brown and Forsythe (1974), labels of runs permuted: docs/error-rates.md.
+    """
+    steps = times_below(entry.values, grid, entry.steps_per_epoch).mean(axis=1)
+    apart: FloatArray = np.abs(steps - np.median(steps))
+    return apart
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -29,8 +29,10 @@ from qrlsuite.results.text import (
     mean_text,
     p_text,
     percent,
+    score_text,
 )
 from qrlsuite.statistics import LearningCurves
+from qrlsuite.statistics.final import final_scores
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.planning import runs_at_difference
 from qrlsuite.statistics.sequential import Decided, Decision, PairDecision
@@ -71,6 +73,8 @@ class State(Shown):
         One line for each entry whose seeds were handed to a queue.
     lost:
         By entry, a sentence about seeds that were asked for and are not there.
+    notes:
+        On the entries: how their settings were found, and what trained them.
     """
 
     study: Study
@@ -84,6 +88,7 @@ class State(Shown):
     decision: Decision
     submitted: tuple[str, ...] = ()
     lost: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def missing(self) -> dict[str, int]:
@@ -212,6 +217,7 @@ class State(Shown):
             "core_hours_at_most": self.cost(dict.fromkeys(study.entries, study.design.looks[-1])),
             "submitted": list(self.submitted),
             **({"lost": dict(self.lost)} if self.lost else {}),
+            **({"notes": list(self.notes)} if self.notes else {}),
         }
 
     def levels(self) -> list[dict[str, Any]]:
@@ -250,6 +256,7 @@ class State(Shown):
             "levels": list(pair.levels),
             "difference": pair.difference if finite else None,
             "interval": list(pair.interval) if finite else None,
+            "final_scores": self.finals(pair) or None,
             "leading_threshold": self.study.grid.thresholds[pair.leading] if led else None,
             "leading_difference": _number(pair.leading_difference) if finite else None,
             "leading_interval": [_number(end) for end in pair.leading_interval] if led else None,
@@ -284,7 +291,8 @@ class State(Shown):
             yield Text(f"hash {study.hash}, first seed begun {self.begun_at}")
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
-        yield from map(Text, filter(None, (reason_note(study), lost_note(self), TURNED.get(study.hash))))
+        told = reason_note(study), lost_note(self), TURNED.get(study.hash), *self.notes
+        yield from map(Text, filter(None, told))
         yield from map(Text, self._cost(facts))
 
     def sheets(self) -> list[Sheet]:
@@ -309,6 +317,15 @@ class State(Shown):
     def verdict(self, pair: PairDecision) -> str:
         """Return a pair's verdict, and whether there was no time for another one."""
         return f"{pair.verdict}, at the horizon" if self.late(pair) else pair.verdict
+
+    def finals(self, pair: PairDecision) -> list[float]:
+        """Return both final scores at a pair's last look; empty before. They have no p: looks stop by steps."""
+        seen = [
+            replace(self.curves[name], values=self.curves[name].values[: pair.n_runs])
+            for name in (pair.first, pair.second)
+            if pair.p
+        ]
+        return [float(final_scores(each).mean()) for each in seen]
 
     def _design(self) -> Iterator[str]:
         """Describe the design, which is fixed when the first seed is trained."""
@@ -441,6 +458,11 @@ def _leading_text(pair: PairDecision, grid: Grid) -> str:
     return f"; at {grid.thresholds[pair.leading]:g}: {percent(pair.leading_difference)}, {ends}"
 
 
+def finals_text(outcome: State, pair: PairDecision) -> str:
+    """Return `0.942 / 0.791`, the final scores of A and B; empty before a look."""
+    return " / ".join(map(score_text, outcome.finals(pair)))
+
+
 def needs_text(outcome: State, needs: Mapping[str, Any] | None) -> str:
     """Describe the `needs` of an open pair from `as_dict`."""
     if needs is None or outcome.ended:
@@ -468,7 +490,7 @@ def _number(value: float) -> float | None:
 
 def _sheet(outcome: State, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Sheet:
     """Return the table of some pairs."""
-    heads = ["pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"]
+    heads = ["pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "final score", "needs"]
     rows = [
         [
             versus(pair),
@@ -476,6 +498,7 @@ def _sheet(outcome: State, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]
             str(pair.n_runs),
             *difference_text(pair, outcome.study.grid),
             p_text(pair.p[-1]) if pair.p else "",
+            finals_text(outcome, pair),
             needs_text(outcome, facts["needs"]),
         ]
         for pair, facts in pairs

@@ -97,7 +97,7 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
     assert "| - | mlp width=8 |" in say("leaderboard", "--runs", runs, "--format", "markdown").stdout
 
     compared = qrlsuite("compare", "mlp width=16", "mlp width=8", "--runs", runs)
-    assert "undecided: fewer than 20 seeds" in compared.stdout
+    assert "settings: default, not tuned" in compared.stdout
     with pytest.raises(UnknownNameError, match="'mlp width=4' has seeds from 1,000,000 up alone"):
         say("evaluate", "mlp width=4", "--runs", runs)
     say("plot", "curves", "--runs", runs, "--out", str(tmp_path / "c.svg"))

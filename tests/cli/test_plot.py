@@ -128,18 +128,20 @@ def test_compare_begins_with_the_verdict_and_fits_eighty_columns(entries: list[E
     assert said.startswith(
         "mlp width=64 needs 74% fewer steps than mlp width=16 (74% to 74%, 30 seeds each, p < .0001)"
     )
-    assert "final score: 0.9" in said
-    assert said.endswith(
-        "by the paper's rule, cell by cell: outperforms: significantly fewer samples in 49 of 49 cells, "
+    assert "); final score 0.950 against 0.950, p = 1" in said
+    assert said.endswith("settings: default, not tuned")
+    assert "cell" not in output
+    paper = " ".join(call("compare", "width=64", "width=16", "--rule", "paper").split())
+    assert (
+        "by the paper's rule, cell by cell, 30 seeds each: outperforms: significantly fewer samples in 49 of 49 cells, "
         "significantly more in none"
-    )
-    assert "rule '" not in output
+    ) in paper
 
 
 def test_compare_shows_cells_by_the_rule_that_is_named(entries: list[EntryResults]) -> None:
     output = call("compare", "width=64", "width=16", "--rule", "times")
     assert all(len(line) <= 80 for line in output.splitlines())
-    assert "rule 'times':" in " ".join(output.split())
+    assert "by rule 'times', cell by cell, 30 seeds each: " in " ".join(output.split())
     assert output.strip().endswith("+ significantly fewer samples")
 
 

@@ -14,7 +14,7 @@ from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
-from qrlsuite.statistics import LearningCurves, Verdict, compare
+from qrlsuite.statistics import Comparison, LearningCurves, Verdict, compare
 from tests.docs import load
 from tests.statistics.conftest import SURFACE
 
@@ -30,6 +30,12 @@ def printed(*options: str) -> str:
     return CliRunner().invoke(build(), words).stdout
 
 
+def compared_cells(first: str, second: str) -> Comparison:
+    cells = api.compare(LOAD(first, "beam6g"), LOAD(second, "beam6g"), rule="paper").cells
+    assert cells is not None
+    return cells
+
+
 def test_the_decided_pairs_are_the_boards() -> None:
     [section] = json.loads(printed("--format", "json"))["sections"]
     labels = {row["entry"]: row["label"].removeprefix("ddqn ") for row in section["rows"]}
@@ -37,7 +43,7 @@ def test_the_decided_pairs_are_the_boards() -> None:
     order = [labels[row["entry"]] for row in times["entries"]]
     pairs = times["adjusted_p"][order.index("mlp width=16 lr=0.002")]
     p = [f"{pairs[order.index(f'vqc-native qubits={n}')]:.3f}".removeprefix("0") for n in (10, 8)]
-    compared = api.compare(LOAD("vqc-native qubits=10", "beam6g"), LOAD("mlp width=16 lr=0.002", "beam6g"))
+    compared = compared_cells("vqc-native qubits=10", "mlp width=16 lr=0.002")
     cells = f"{compared.count(Verdict.WIN)} of {sum(len(line) for line in compared.verdicts)}"
     text = PAGE.replace("\n", " ")
     assert f"{times['decided']} of {times['pairs']} pairs are decided." in text
@@ -62,7 +68,7 @@ def test_the_core_hours_are_the_boards() -> None:
     ],
 )
 def test_the_cells_of_the_retuned_network(first: str, second: str, sentence: str) -> None:
-    comparison = api.compare(LOAD(first, "beam6g"), LOAD(second, "beam6g"))
+    comparison = compared_cells(first, second)
     assert comparison.count(Verdict.LOSS) == 0
     assert sentence.format(comparison.count(Verdict.WIN)) in BOARD.replace("\n", " ")
 
@@ -140,7 +146,7 @@ def test_what_the_board_of_three_spins_says() -> None:
         return str(found)
 
     sines, width = called("mlp width=5 activation=sin "), called("mlp width=5 input_scale")
-    said = api.compare(LOAD(sines, "vqe-ising"), LOAD(width, "vqe-ising")).verdict
+    said = api.compare(LOAD(sines, "vqe-ising"), LOAD(width, "vqe-ising")).sentence
     assert "needs 32% fewer steps" in said
     assert "(26% to 37%, 50 seeds each" in said
     assert "with sines it needs 32% fewer steps (26% to 37%)" in text

@@ -18,7 +18,7 @@ from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import report
+from qrlsuite.leaderboard import report, rules
 from qrlsuite.leaderboard.boards import board, steps
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.boards.ranked import ranking_of
@@ -61,11 +61,11 @@ def mostly_at_the_cap() -> board.Leaderboard:
 def test_entries_that_reached_no_threshold_are_named_with_what_ranks_them(
     mostly_at_the_cap: board.Leaderboard,
 ) -> None:
-    line = (
-        "no seed reached a threshold, so steps do not tell them apart: poor one, poor two. --by area ranks by"
-    )
-    assert line in markdown(mostly_at_the_cap)
-    assert "no seed reached" not in markdown(boards.of([flat("best one", 0.1, 0.62), flat("poor one", 0.1)]))
+    named = "poor one (20 of 20 seeds)"
+    line = "failed (reached no threshold; `--by area` ranks by the learning curves alone): "
+    assert f"{line}{named}, poor two (20 of 20 seeds)" in markdown(mostly_at_the_cap)
+    one = markdown(boards.of([flat("best one", 0.1, 0.62), flat("poor one", 0.1)]))
+    assert f"failed (reached no threshold): {named}" in one
 
 
 def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
@@ -86,8 +86,8 @@ def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.
     best, one, two = (row.entry for row in mostly_at_the_cap.sections[0].tiers)
     neither = "not reached: both are at the cap in all 49 cells"
     most = "significantly fewer samples in 7 of 49 cells, significantly more in none; both at the cap in 42"
-    assert compare_entries(one, two).as_dict()["sentence"] == neither
-    assert compare_entries(best, two).as_dict()["sentence"] == f"outperforms: {most}"
+    for entry, said in ((one, neither), (best, f"outperforms: {most}")):
+        assert compare_entries(entry, two, rules.load("paper")).as_dict()["cells"]["sentence"] == said
 
 
 def test_a_tier_says_on_how_few_cells_it_rests() -> None:
@@ -101,7 +101,7 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
     assert re.search(r"\| 2 \| later one \| [^|]* \| 7 of 7 \|", paper(made))
     page = report.render(made)
     assert ">7 of 7</abbr>" in page
-    assert "best one outperforms the other entry." in page
+    assert "best one needs " in page
 
 
 def test_the_picture_of_tiers_names_who_reached_nothing(mostly_at_the_cap: board.Leaderboard) -> None:
@@ -165,12 +165,15 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
 
 
 CPU, CUDA = (Provenance(device=DeviceRecord(kind=kind), versions={"torch": kind}) for kind in ("cpu", "cuda"))
+REGRET = {"goal": 0.05, "expected": 0.04, "low": 0.01, "high": 0.1, "near": 0.5}
 NOTES: dict[str, dict[str, Any]] = {
     "trained on several kinds of device, see `qrlsuite show ENTRY`: {} (cpu, cuda)": {"provenance": [CPU, CUDA]},
     "made with several versions, see `qrlsuite show ENTRY`: {} (torch)": {"provenance": [CPU, CUDA]},
     "diverged (numbers of the agents are no longer finite), judged with the scores that they had: {} (20 of 20 seeds)":
     {"diverged": 3},
-    "settings found by tuning: {} (3 trials)": {"tuning": {"trials": 3}},
+    "settings: tuned (3 trials, regret 4%), search: bayesian, too few: {}; default, not tuned: model-1 width=2":
+    {"tuning": {"sampler": "bayesian", "trials": 3, "note": "regret 4%; too few", "regret": REGRET}},
+    "failed (reached no threshold): {} (20 of 20 seeds)": {"curves": np.zeros((20, 100))},
 }  # fmt: skip
 
 
@@ -183,7 +186,8 @@ def test_every_verdict_names_what_may_lie_behind_it(note: str) -> None:
     assert text in compare_entries(changed, plain).remarks
     assert text in rank_by_score([changed, plain], 200_000, "score").notes()
     others = compare_entries(boards.changed(one, provenance=[CPU]), plain).remarks
-    assert not any(remark.partition(":")[0] == text.partition(":")[0] for remark in others)
+    assert text not in others
+    assert "settings: default, not tuned" in others
 
 
 def test_a_setting_is_judged_by_the_run_as_trained_not_as_cut() -> None:
@@ -231,16 +235,6 @@ def test_the_board_says_where_settings_come_from() -> None:
     less = {**record, "budget": "2 settings per option"}
     unequal = markdown(boards.of([tuned, boards.changed(two, tuning=less)]))
     assert "different budgets: 2 settings per option; 8 settings per option" in unequal
-
-
-def test_what_tuning_took_is_said() -> None:
-    one, two, three = boards.graded(3)
-    tuning = {"trials": 7, "steps": 10_500_000, "core_hours": 0.12}
-    made = boards.of(
-        [boards.changed(one, tuning=tuning), boards.changed(two, tuning={"trials": None}), three]
-    )
-    text = f"{one.label} (7 trials, 10,500,000 steps, 0.12 core-hours), {two.label} (budget not known)"
-    assert f"settings found by tuning: {text}" in markdown(made).split("  \n")
 
 
 def test_a_published_variant_of_a_task_is_known_by_its_name(tmp_path: Path) -> None:

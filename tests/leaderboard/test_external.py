@@ -274,8 +274,10 @@ def test_thresholds_and_scores_are_rounded_alike(tmp_path: Path) -> None:
         api.import_curves(
             wins, steps=10 * np.arange(1, 31), task=task, thresholds=[6], runs=tmp_path, **options
         )
-        found = api.compare("a", "b", task=task, runs=tmp_path)
-        verdicts.append((found.verdict, str(found.outcome), found.pair.times.means.tolist()))
+        found = api.compare("a", "b", task=task, runs=tmp_path, rule="paper")
+        assert found.cells is not None
+        said = found.sentence.partition("; final")[0]
+        verdicts.append((said, str(found.cells.outcome), found.pair.times.means.tolist()))
     assert verdicts[0] == verdicts[1]
     assert verdicts[0][0].startswith("a needs")
     steps, noise = 10 * np.arange(1, 4), 1 + generator.random((20, 1))

@@ -115,10 +115,10 @@ def test_a_metric_is_ranked_and_less_is_better(walked: tuple[Path, EntryResults]
         assert text in page, text
 
     verdict = compare_entries(entry, worse)
-    assert re.match(r"mlp width=16 needs .* fewer steps than ", verdict.verdict.removeprefix("ddqn ")), (
-        verdict.verdict
+    assert re.match(r"mlp width=16 needs .* fewer steps than ", verdict.sentence.removeprefix("ddqn ")), (
+        verdict.sentence
     )
-    assert verdict.pair.final.startswith("final steps-taken: ")
+    assert "; final steps-taken " in verdict.sentence
     assert verdict.pair.notes[0].startswith("steps above threshold")
     drawn = pictures.draw("curves", [entry, worse])
     assert drawn.axes[0].get_ylabel() == "validation steps-taken"

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import doctest
 import io
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from qrlsuite.errors import QrlSuiteError
-from qrlsuite.leaderboard.boards import pair
+from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.leaderboard import rules
+from qrlsuite.leaderboard.boards import pair, scores
 from qrlsuite.leaderboard.boards.compared import compare_entries, pair_table
 from qrlsuite.leaderboard.shelf.curves import BESIDE, EntryResults
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
+
+GRID = boards.entry("any").task_file.ranking.grid
 
 
 def entry(
@@ -46,14 +50,15 @@ def test_the_helpers_are_right_by_hand() -> None:
 def test_the_first_is_the_subject_in_sentence_and_table() -> None:
     """M of 20 and 40 epochs, with half an epoch: 40.5 / 20.5 - 1."""
     fast, slow = entry("fast", spread(18)), entry("slow", spread(38))
-    unseen = "; none of 30 seeds failed, but up to 9.5% of others may"
+    unseen = "; final score 0.950 against 0.950, p = 1; none of 30 seeds failed, but up to 9.5% of others may"
     there, back = compare_entries(fast, slow), compare_entries(slow, fast)
     assert (
-        there.verdict
+        there.sentence
         == f"fast needs 49% fewer steps than slow (48% to 51%, 30 seeds each, p < .0001){unseen}"
     )
     assert (
-        back.verdict == f"slow needs 98% more steps than fast (92% to 103%, 30 seeds each, p < .0001){unseen}"
+        back.sentence
+        == f"slow needs 98% more steps than fast (92% to 103%, 30 seeds each, p < .0001){unseen}"
     )
     for compared, sign, word in ((there, "-49%", "fewer"), (back, "+98%", "more")):
         assert {(row[3].partition(" ")[0], row[-1]) for row in compared.pair.rows()} == {(sign, word)}
@@ -78,18 +83,18 @@ def test_the_verdict_is_that_of_the_mean_whatever_a_threshold_says() -> None:
         for run in range(30):
             each.curves[run, noise.integers(30, 100) + seed // 20 :] = 0.95
     compared = compare_entries(first, second)
-    assert compared.verdict.startswith(
+    assert compared.sentence.startswith(
         "not told apart: first needs 4.7% more steps than second, 11% fewer to 23%"
     )
-    assert compared.verdict.endswith("; so many seeds would show 21% fewer in 4 of 5 cases")
+    assert "; so many seeds would show 21% fewer in 4 of 5 cases; final score 0." in compared.sentence
     assert [row[-1] for row in compared.pair.rows()].count("fewer") == 1
 
 
 def test_what_so_few_seeds_cannot_know_is_a_clause() -> None:
     many = entry("many", spread(18, 60))
-    assert compare_entries(many, entry("others", spread(38, 60))).verdict.endswith("p < .0001)")
+    assert compare_entries(many, entry("others", spread(38, 60))).sentence.endswith("p = 1")
     wide = entry("wide", np.resize([2, 96], 20))
-    said = compare_entries(wide, entry("narrow", spread(5, 20))).verdict
+    said = compare_entries(wide, entry("narrow", spread(5, 20))).sentence
     assert said.startswith("wide needs 560% more steps than narrow (")
     assert said.endswith(
         "; none of 20 seeds failed, but up to 14% of others may; one entry's seeds vary 5 times as much as the "
@@ -98,15 +103,23 @@ def test_what_so_few_seeds_cannot_know_is_a_clause() -> None:
     failing = entry("failing", [18, 20, 100, 19, 22])
     assert (
         "; none of 8 seeds failed, but up to 31% of others may"
-        in compare_entries(failing, entry("quick", spread(2, 8))).verdict
+        in compare_entries(failing, entry("quick", spread(2, 8))).sentence
     )
 
 
 def test_two_that_reached_nothing_are_told_what_to_do() -> None:
     first, second = entry("first", spread(18), 0.5), entry("second", spread(18), 0.2)
-    said = compare_entries(first, second).verdict
-    assert said == "neither reached any of the 7 thresholds within 200k steps: train longer, or lower them"
-    assert "difference +0.3 (+0.3 to +0.3, p < .0001)" in compare_entries(first, second).pair.final
+    said = compare_entries(first, second).sentence
+    assert said == (
+        "neither reached any of the 7 thresholds within 200k steps: train longer, or lower them; "
+        "final score 0.500 against 0.200, p < .0001"
+    )
+    compared = compare_entries(first, second)
+    assert compared.pair.notes[-1].endswith("of the epochs (10); difference +0.3 (+0.3 to +0.3)")
+    assert compared.remarks[0] == (
+        "failed (reached no threshold; `--by area` ranks by the learning curves alone): "
+        "first (30 of 30 seeds), second (30 of 30 seeds)"
+    )
     assert [pair._signed(value) for value in (130.4, -99.6, -3.44, 0.0123)] == [
         "+130",
         "-99.6",
@@ -117,24 +130,22 @@ def test_two_that_reached_nothing_are_told_what_to_do() -> None:
 
 def test_equals_are_not_told_apart_and_too_few_cannot_decide() -> None:
     first, second = entry("first", spread(20)), entry("second", spread(20))
-    assert compare_entries(first, second).verdict == (
+    assert compare_entries(first, second).sentence == (
         "not told apart: first needs 0.0% fewer steps than second, 3.3% fewer to 3.4% more (30 seeds each, p = 1); "
-        "so many seeds would show 4.6% fewer in 4 of 5 cases"
+        "so many seeds would show 4.6% fewer in 4 of 5 cases; final score 0.950 against 0.950, p = 1"
     )
     few = compare_entries(entry("few", spread(20, 3)), second)
-    assert few.verdict == (
+    assert few.sentence == (
         "cannot be decided with so few seeds (4 each could): so far few needs 4.4% fewer steps than second (3 and 30 "
-        "seeds)"
+        "seeds); final score 0.950 against 0.950"
     )
     assert {row[-2:] for row in few.pair.rows()} == {("-", "undecided")}
-    assert "p " not in few.pair.final.partition(";")[0]
     four = compare_entries(entry("four", spread(20, 4)), entry("later", spread(60, 4)))
-    assert four.verdict.startswith(
-        "four needs 65% fewer steps than later (61% to 68%, 4 seeds each, p = .029); none of 4"
+    assert four.sentence.startswith(
+        "four needs 65% fewer steps than later (61% to 68%, 4 seeds each, p = .029); final score 0.950 "
     )
     one = compare_entries(entry("one", spread(20, 1)), second)
-    assert one.verdict.endswith("so far one needs 8.9% fewer steps than second (1 and 30 seeds)")
-    assert one.pair.final == ""
+    assert one.sentence.endswith("so far one needs 8.9% fewer steps than second (1 and 30 seeds)")
 
 
 def test_where_thresholds_cross_the_sentence_says_where_the_other_is_ahead() -> None:
@@ -142,10 +153,43 @@ def test_where_thresholds_cross_the_sentence_says_where_the_other_is_ahead() -> 
     early.curves[:, 90:] = 0.95
     compared = compare_entries(early, late)
     assert compared.pair.times.direction is Direction.MORE
-    assert ", p < .0001), but early needs fewer at 0.7, 0.65, 0.6; none" in compared.verdict
-    turned = compare_entries(late, early).verdict
+    assert ", p < .0001), but early needs fewer at 0.7, 0.65, 0.6; final score " in compared.sentence
+    turned = compare_entries(late, early).sentence
     assert turned.startswith("late needs ")
-    assert ", p < .0001), but early needs fewer at 0.7, 0.65, 0.6; none" in turned
+    assert ", p < .0001), but early needs fewer at 0.7, 0.65, 0.6; final score " in turned
+
+
+def test_another_number_may_stand_first() -> None:
+    """The last tenth of 100 epochs: .72 against .95. Half of the alike seeds begin one epoch later than the others."""
+    low, high = entry("low", spread(18), 0.72), entry("high", spread(40))
+    steps = "; low needs "
+    said = {
+        by: compare_entries(low, high, by=by).sentence.partition(steps) for by in ("score", "area", "spread")
+    }
+    assert all(rest for _, found, rest in said.values() if found == steps)
+    assert said["score"][0] == "low has a lower final score than high (0.720 against 0.950, p < .0001)"
+    assert said["area"][0].startswith("not told apart: area under the learning curve 0.59")
+    assert said["spread"][0].startswith("low has a lower spread between seeds than high (")
+    alike, apart = entry("alike", np.resize([20, 22], 30)), entry("apart", np.resize([20, 60], 30))
+    found = compare_entries(alike, apart, by="spread")
+    assert found.sentence.startswith(
+        "alike has a lower spread between seeds than apart (2k against 40k, p < .0001); alike needs "
+    ), "half of the seeds are 2 and 40 epochs of 2000 steps apart: 1 and 20 from the median"
+    few = compare_entries(entry("few", np.resize([20, 22], 19)), apart, by="spread")
+    assert few.sentence.startswith("cannot be decided with so few seeds: spread between seeds ")
+    assert found.as_dict()["times"]["spread"]["means"] == [2000, 40000]
+    with pytest.raises(OptionError, match="--by shots: expected score or area or spread"):
+        compare_entries(alike, apart, by="shots")
+
+
+def test_cells_are_there_by_a_rule_alone() -> None:
+    pair_of = entry("fast", spread(18)), entry("slow", spread(38))
+    assert compare_entries(*pair_of).cells is None
+    assert "cells" not in compare_entries(*pair_of).as_dict()
+    judged = compare_entries(*pair_of, rule=rules.load("paper"))
+    assert judged.further[-1].startswith("by the paper's rule, cell by cell, 30 seeds each: outperforms: ")
+    assert judged.as_dict()["cells"]["outcome"] == "outperforms"
+    assert judged.sentence == compare_entries(*pair_of).sentence
 
 
 def test_the_board_of_more_entries_is_stricter() -> None:
@@ -155,8 +199,7 @@ def test_the_board_of_more_entries_is_stricter() -> None:
     assert alone.pair.times.direction is Direction.FEWER
     others = [entry(f"other {k}", spread(20 + k)) for k in range(6)]
     few = entry("few", spread(30, 19))
-    grid = alone.grid
-    among = pair.on_board(first, second, [first, second, *others, few], grid, 0.05)
+    among = pair.on_board(first, second, [first, second, *others, few], 0.05)
     assert among is not None
     assert among.n_entries == 8
     assert alone.pair.times.p < 0.05 < among.adjusted
@@ -164,9 +207,9 @@ def test_the_board_of_more_entries_is_stricter() -> None:
         "on the board of 8 entries, which is stricter (28 pairs): not told apart, adjusted p = "
     )
     renamed = replace(first, mark=BESIDE)
-    assert pair.on_board(first, second, [renamed, second, *others], grid, 0.05) == among
-    assert pair.on_board(first, second, [first, second], grid, 0.05) is None
-    assert pair.on_board(first, few, [first, few, *others], grid, 0.05) is None
+    assert pair.on_board(first, second, [renamed, second, *others], 0.05) == among
+    assert pair.on_board(first, second, [first, second], 0.05) is None
+    assert pair.on_board(first, few, [first, few, *others], 0.05) is None
 
 
 def test_numbers_in_a_label_are_never_cut_by_a_narrow_terminal() -> None:
@@ -220,19 +263,22 @@ def test_the_board_says_of_a_pair_what_compare_says_with_its_own_p() -> None:
         [section] = boards.of([one, other]).sections
         rows = {row.entry.label: row for row in section.times.rows}
         row_of = [rows[each.label] for each in (one, other)]
-        on = pair.pair_on(section.times, *row_of, alone.grid, alone.labels)
-        assert on.sentence.replace("adjusted ", "") == alone.verdict.partition("; so many")[0]
+        on = pair.pair_on(section.times, scores.finals(section), *row_of, GRID, alone.pair.labels)
+        without = re.sub("; so many [^;]*", "", alone.sentence)
+        assert on.sentence.replace("adjusted ", "") == without
     close = entry("first", np.arange(10, 50)), entry("second", np.arange(16, 56))
     [section] = boards.of([*close, *(entry(f"other {k}", spread(20 + k)) for k in range(6))]).sections
     rows = {row.entry.label: row for row in section.times.rows}
     alone = compare_entries(*close)
-    on = pair.pair_on(section.times, rows["first"], rows["second"], alone.grid, alone.labels)
-    assert alone.verdict.startswith("first needs ")
+    on = pair.pair_on(
+        section.times, scores.finals(section), rows["first"], rows["second"], GRID, alone.pair.labels
+    )
+    assert alone.sentence.startswith("first needs ")
     assert on.sentence.startswith("not told apart: first needs ")
     assert on.times.p > alone.pair.times.p
 
 
 def test_a_verdict_of_short_runs_begins_with_their_steps() -> None:
     short = [entry(name, spread(start)).cut(50) for name, start in (("first", 20), ("second", 40))]
-    said = compare_entries(*short).verdict
+    said = compare_entries(*short).sentence
     assert said.startswith("after 100k of 200k steps: first needs 4")

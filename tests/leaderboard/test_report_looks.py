@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
@@ -130,3 +131,19 @@ def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], ru
 def test_published_studies_are_shown_with_the_boards_of_their_task(tmp_path: Path) -> None:
     found, refused = published_studies.collected(Selection(tmp_path, published=True, tasks=("pulse",)))
     assert ([outcome.study.name for outcome in found], refused) == (["equal-size-pulse"], [])
+
+
+def test_final_scores_and_how_settings_were_found_stand_beside_the_verdicts() -> None:
+    """Without p: looks stop by steps, so that no test for a fixed number of seeds applies."""
+    state = studies.read_outcome("equal-size-cartpole-ppo", Path("no-runs"))
+    pair, [facts, *_] = state.pairs[0], state.as_dict()["pairs"]
+    last = [state.curves[name].values[: pair.n_runs, -3:].mean() for name in (pair.first, pair.second)]
+    assert facts["final_scores"] == pytest.approx(last)
+    (settings,) = (note for note in state.notes if note.startswith("settings: "))
+    assert settings.startswith(
+        "settings: tuned (160 trials, 56 seeds, regret 6%), search: bayesian: circuit; "
+    )
+    assert settings in " ".join(str(state).split())
+    shown = looks_report.view(state)
+    assert shown["pairs"][0]["finals"] == "final score 0.999 / 0.969"
+    assert settings in shown["note"]

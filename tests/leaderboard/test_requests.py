@@ -56,7 +56,7 @@ def test_deleted_seeds_make_every_verdict_provisional(runs: Path, tmp_path: Path
     compared = say("compare", "mlp width=8", "mlp width=16", "--runs", str(runs)).stdout
     assert compared.startswith("provisional: ")
     assert SAID in " ".join(compared.split())
-    assert SAID in answer("compare", "mlp width=8", "mlp width=16", "--runs", str(runs))["missing"][0]
+    assert SAID in answer("compare", "mlp width=8", "mlp width=16", "--runs", str(runs))["notes"][0]
     for axis in ("steps", "executions", "core-hours", "score", "area"):
         board = say("leaderboard", "--by", axis, "--runs", str(runs)).stdout
         assert SAID in " ".join(board.split()), axis
@@ -103,7 +103,7 @@ def test_a_withdrawn_request_is_named_with_its_reason(runs: Path, tmp_path: Path
     note = "seeds that were asked for, and withdrawn: mlp width=8 (6:8: the disk failed)"
     compared = api.compare("mlp width=8", "mlp width=16", runs=runs)
     assert note in " ".join(compared.further).replace("ddqn ", "")
-    assert not compared.verdict.startswith("provisional")
+    assert not compared.sentence.startswith("provisional")
     say("export", "mlp width=8", "--runs", str(runs), "--out", str(tmp_path / "out"))
     (folder,) = (tmp_path / "out" / "tiny").iterdir()
     assert published.read(folder).entry_results().withdrawn == {6: "the disk failed", 7: "the disk failed"}
@@ -135,7 +135,7 @@ def test_a_run_that_was_stopped_is_provisional_until_it_is_continued(runs: Path)
     train_group(store.path, range(20), 2)
     entry = api.load("mlp width=4", runs=runs)
     assert (entry.epochs, len(entry.seeds), len(entry.missing)) == (2, 20, 20)
-    assert api.compare("mlp width=4", "mlp width=8", runs=runs).verdict.startswith(
+    assert api.compare("mlp width=4", "mlp width=8", runs=runs).sentence.startswith(
         "provisional: after 120 of 180"
     )
     (section,) = api.board(runs=runs, horizon=120).sections

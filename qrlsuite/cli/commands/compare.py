@@ -1,4 +1,4 @@
-"""`qrlsuite compare`: which of two entries needs fewer steps, by how much and how surely."""
+"""`qrlsuite compare`: which of two entries needs fewer steps, by how much and how surely, and how both end."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from qrlsuite.cli.arguments import (
 )
 from qrlsuite.engine.sheet import text_of
 from qrlsuite.engine.terminal import command
+from qrlsuite.leaderboard.boards.scores import OF_RUNS
 from qrlsuite.results.store import write_atomically
 from qrlsuite.statistics import Direction
 
@@ -41,21 +42,30 @@ def compare(
     ],
     task: AmongOption = None,
     rule: RuleOption = None,
+    by: Annotated[
+        str,
+        typer.Option(
+            "--by",
+            metavar="|".join(("steps", *OF_RUNS)),
+            help="What the sentence begins with, or a cost that the task's [ranking] names.",
+        ),
+    ] = "steps",
     label: LabelOption = None,
     out: TableFileOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Say which of two entries needs fewer steps, by how much and how surely; then threshold by threshold.
+    """Say which of two entries needs fewer steps, by how much and how surely, and how both end.
 
-    The final scores and the paper's rule follow, and the verdict on the board of all entries of the task, which is
-    stricter. With --rule the cells of the task's ranking grid are shown, too, at equal numbers of seeds.
+    The thresholds follow one by one, then the verdict on the board of all entries of the task, which is stricter, and
+    how settings were found. --rule paper adds the paper's cells, at equal numbers of seeds; --by score, area or spread
+    begins with that number.
 
     Example: qrlsuite compare --task beam6g "mlp width=64" "mlp width=16"
     """
     comparison = api.compare(
-        first, second, task=task, runs=runs, published=published, rule=rule, labels=label or ()
+        first, second, task=task, runs=runs, published=published, rule=rule, by=by, labels=label or ()
     )
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))

@@ -78,7 +78,8 @@ def leaderboard(
             "--by",
             metavar="|".join(AXES),
             help="Axis of the ranking: environment steps, executions, shots or core-hours below threshold, the "
-            "final score, the area under the learning curve, or a cost that the task's [ranking] names.",
+            "final score, the area under the learning curve, the spread between seeds, or a cost that the task's "
+            "[ranking] names.",
             autocompletion=lambda: list(AXES),
         ),
     ] = "steps",
@@ -113,8 +114,9 @@ def leaderboard(
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all; --entry then compares these alone. Entries whose record does not hold the cost, or not so
     that it can be compared, have no rank.
-    --by score ranks by the mean score of the last tenth of the epochs, --by area by the mean of all epochs. Metrics of
-    the environment that the task file names in [ranking] costs are columns; --by their names ranks by them, less first.
+    --by score ranks by the mean score of the last tenth of the epochs, --by area by the mean of all epochs, --by spread
+    by how far seeds are from the median seed, in steps below threshold. Metrics of the environment that the task file
+    names in [ranking] costs are columns; --by their names ranks by them, less first.
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
