@@ -41,7 +41,7 @@ TOLERANCE = 1e-9
 """Relative. Numbers below a millionth of it are noise around 0."""
 
 AXES = ("steps", "executions", "shots", "core-hours", "energy-error")
-AXES_OF_SCORES = ("score", "area")
+AXES_OF_SCORES = ("score", "area", "spread")
 RULES = ("paper", "times", "steps")
 DEGREES = ("beam6g", "beam6g-degree4", "beam6g-degree5", "beam6g-degree6")
 TOGETHER = (
@@ -109,7 +109,7 @@ def _pairs() -> Iterator[str]:
     for section in read("boards")[f"leaderboard --published --format json --by {AXES[0]}"]["sections"]:
         names = [row["entry"] for row in section["times"]["entries"]]
         for first, second in itertools.pairwise(names):
-            yield f"compare {first} {second} --task {section['task']} --published"
+            yield f"compare {first} {second} --task {section['task']} --published --rule paper"
 
 
 def _studies_shown() -> Iterator[str]:
