@@ -463,6 +463,10 @@ def test_a_sweep_says_what_is_wrong_with_its_inputs():
     model, x = hybrid(), observations(3, 5, 3)
     with pytest.raises(ValueError, match=r"take x \(3, B, 3\); x is \(3, 5, 4\)"):
         model(observations(3, 5, 4))
+    with pytest.raises(ValueError, match=r"x is \(3, 5, 2\)"):
+        population.chosen_errors(
+            model, observations(3, 5, 2), torch.zeros((3, 5), dtype=torch.int64), x[..., 0]
+        )
     with pytest.raises(ValueError, match=r"choose one of 3 outputs .* goes from 0 to 3"):
         population.chosen_errors(model, x, torch.tensor([[0, 1, 2, 3, 0]] * 3), x[..., 0])
     x[1, 4, 0] = torch.nan

@@ -254,10 +254,6 @@ class HybridSweep(Sweep):
 
     def values(self, x: Array, keep: bool) -> tuple[Array, _Pass]:
         """Return outputs and what `pull` needs, see `Sweep`."""
-        if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.inputs:
-            raise ValueError(
-                f"networks of {self.seeds} seeds take x ({self.seeds}, B, {self.inputs}); x is {x.shape}"
-            )
         out = np.empty((*x.shape[:2], self.outputs), np.float32)
         records = self._records(x.shape[1]) if keep else None
         self._pass(x, records, True, out)
@@ -319,6 +315,10 @@ class HybridSweep(Sweep):
         out: Array,
         wanted: _Differentiated = _NOTHING,
     ) -> None:
+        if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.inputs:
+            raise ValueError(
+                f"networks of {self.seeds} seeds take x ({self.seeds}, B, {self.inputs}); x is {x.shape}"
+            )
         records = kept or Records("circuit", 1, self.rows, self.work.sums.shape[1])
         told = passes(
             self.simulator.tables, x, self.parameters, self.begins, self.sizes, records.array, forth,
