@@ -503,8 +503,12 @@ def _sheet(outcome: State, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]
         ]
         for pair, facts in pairs
     ]
-    if not any(row[-1] for row in rows):
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
+    filled = [
+        place
+        for place, head in enumerate(heads)
+        if head not in ("final score", "needs") or any(row[place] for row in rows)
+    ]
+    heads, rows = [heads[place] for place in filled], [[row[place] for place in filled] for row in rows]
     return Sheet.of("", heads, rows, words=(heads[0], "verdict", "B against A", "interval", "needs"))
 
 
