@@ -24,6 +24,7 @@ from qrlsuite.results.text import (
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import MIN_RUNS, TOO_FEW
 from qrlsuite.statistics.curves import reached
+from qrlsuite.statistics.steps import LEAST_RUNS
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.boards.steps import Section
@@ -149,7 +150,7 @@ def _rank_notes(section: Section) -> list[str]:
     few = any(len(row.entry.seeds) < MIN_RUNS for row in section.rows)
     return [
         f"rank: by significant outperformance: {pairs}",
-        *[TOO_FEW] * few,
+        *[f"no rank below {MIN_RUNS} seeds; `qrlsuite compare` decides from {LEAST_RUNS} on"] * few,
         f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.ranking.cell}"
         + policies_text(section),
     ]

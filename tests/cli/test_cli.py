@@ -90,7 +90,7 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
     assert "name: tiny\n" in say("show", task).stdout
     assert say("show", task, "--format", "toml").stdout == TINY
 
-    assert "undecided: fewer than 20 seeds" in qrlsuite("leaderboard", "--runs", runs).stdout
+    assert "no rank below 20 seeds" in qrlsuite("leaderboard", "--runs", runs).stdout
     (section,) = json.loads(say("leaderboard", "--runs", runs, "--format", "json").stdout)["sections"]
     assert {row["label"] for row in section["rows"]} == {"ddqn mlp width=16", "ddqn mlp width=8"}
     assert all(row["tier"] is None and row["seeds"] == 4 for row in section["rows"])

@@ -101,7 +101,7 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
     assert re.search(r"\| 2 \| later one \| [^|]* \| 7 of 7 \|", paper(made))
     page = report.render(made)
     assert ">7 of 7</abbr>" in page
-    assert "best one needs " in page
+    assert '<p class="verdict">best one needs ' in page
 
 
 def test_the_picture_of_tiers_names_who_reached_nothing(mostly_at_the_cap: board.Leaderboard) -> None:
