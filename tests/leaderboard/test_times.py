@@ -20,7 +20,7 @@ from qrlsuite.engine import sheet
 from qrlsuite.errors import FileError, OptionError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import report
-from qrlsuite.leaderboard.boards import board
+from qrlsuite.leaderboard.boards import board, scores
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -92,7 +92,8 @@ def test_few_and_unequal_numbers_are_marked_and_below_20_nothing_is_decided() ->
 
 
 def test_a_pair_whose_decision_may_turn_is_named() -> None:
-    made = times_of(reaching("early", (1, 60)), reaching("steady", (1, 30)))
+    (section,) = board.build([reaching("early", (1, 60)), reaching("steady", (1, 30))]).sections
+    made = section.times
     assert made.special() == made.as_dict()["within_monte_carlo_error"] == []
     facts = {"adjusted": np.full((2, 2), 0.05), "p_error": 2e-5 * ~np.eye(2, dtype=bool)}
     open_still = replace(made, board=replace(made.board, **facts))
@@ -100,8 +101,8 @@ def test_a_pair_whose_decision_may_turn_is_named() -> None:
         "within Monte Carlo error of its level after 10 million relabelings: steady and early, "
         "adjusted p = .05 +- 2e-05"
     ]
-    grid = made.rows[0].entry.task_file.ranking.grid
-    assert "adjusted p = .05 +- 2e-05" in pair_on(open_still, *made.rows, grid, ("a", "b")).sentence
+    said = pair_on(open_still, scores.finals(section), *made.rows, section.ranking.grid, ("a", "b")).sentence
+    assert "adjusted p = .05 +- 2e-05" in said
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0, -0.1, float("nan")])
@@ -259,7 +260,9 @@ def test_sections_of_several_tasks_have_their_own_rules() -> None:
     assert rules == {"beam6g": "times", "cartpole": "intervals"}
     assert set(made.rules) == {"intervals", "times"}
     assert "<q>times, intervals</q>" in report.render(made)
-    assert compare_entries(ruled, boards.changed(ruled, name="b")).rule == "times"
+    cells = compare_entries(ruled, boards.changed(ruled, name="b")).cells
+    assert cells is not None
+    assert cells.rule == "times"
 
 
 def test_an_unknown_rule_is_one_line_with_the_nearest(tmp_path: Path) -> None:
