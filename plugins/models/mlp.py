@@ -100,24 +100,19 @@ class MLPPopulation(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
-        if isinstance(self.input_scale, Tensor) or self.input_scale != 1.0:
-            x = x * self.input_scale
-        whole = self._whole()
+        whole = self.sweep()
         if whole is not None and compilable(x):
             return whole(x)
         parameters = self._listed()
-        return layers(x, parameters[::2], parameters[1::2], self.options.activation)
+        return layers(x * self.input_scale, parameters[::2], parameters[1::2], self.options.activation)
 
     def sweep(self) -> Sweep | None:
         """Return it as one compiled sweep, see `qrlsuite.population.sweep`."""
-        scaled = isinstance(self.input_scale, Tensor) or self.input_scale != 1.0
-        return None if scaled else self._whole()
 
-    def _whole(self) -> Sweep | None:
         def made(own: Sequence[Tensor]) -> Sweep:
             from qrlsuite.compiled.perceptron import LayersSweep
 
-            return LayersSweep(own[::2], own[1::2], self.options.activation)
+            return LayersSweep(own[::2], own[1::2], self.options.activation, self.input_scale)
 
         return None if self.options.activation == "tanh" else sweep(self, self._listed(), made)
 

@@ -170,9 +170,18 @@ class LayersSweep(Sweep):
         Of every layer (S, out, in) and (S, out), float32 on the CPU; one block has a layer's bias behind its weights.
     activation:
         "none", "relu" or "sin", after every layer but the last.
+    scale:
+        Factor of all inputs, or of each network's (S, 1, 1).
     """
 
-    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: str) -> None:
+    def __init__(
+        self,
+        weights: Sequence[Tensor],
+        biases: Sequence[Tensor],
+        activation: str,
+        scale: float | Tensor = 1.0,
+    ) -> None:
+        self.scale = None if isinstance(scale, float) and scale == 1.0 else np.asarray(scale, np.float32)
         self.sizes = _sizes(weights, biases)
         super().__init__([each for pair in zip(weights, biases) for each in pair], int(self.sizes[0]))
         self.activation = activation
@@ -182,6 +191,8 @@ class LayersSweep(Sweep):
         """Return outputs and records, see `Sweep`."""
         if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.inputs:
             raise _misfit(x.shape, self.shapes)
+        if self.scale is not None:
+            x = x * self.scale
         chunks = self.seeds * -(-x.shape[1] // WIDE) if keep else 1
         records = Records("records", chunks, self.rows, WIDE)
         out = np.empty((*x.shape[:2], self.shapes[-1][1]), np.float32)
@@ -216,6 +227,8 @@ class LayersSweep(Sweep):
             np.empty((1, 1, 1), np.float32) if x_gradient is None else x_gradient,
             x_gradient is not None,
         )
+        if x_gradient is not None and self.scale is not None:
+            x_gradient *= self.scale
 
 
 def array(tensor: Tensor) -> Array:

@@ -291,8 +291,6 @@ class PairDecision:
         Runs of each at its last look, 0 before the first.
     p, levels:
         p and the level it was compared with last, at each look so far.
-    relabelings:
-        Relabelings behind each p by rule `steps`.
     difference:
         Mean time of the second over mean time of the first, minus 1, at the last look. After an early stop it is biased
         away from 0.
@@ -308,6 +306,8 @@ class PairDecision:
     leading_difference, leading_interval:
         As `difference`, at this threshold alone; the interval is at the level that p was compared with last. By rule
         `steps` there is none: NaN.
+    relabelings:
+        Relabelings behind each p by rule `steps`.
     """
 
     first: str
@@ -316,7 +316,6 @@ class PairDecision:
     n_runs: int = 0
     p: tuple[float, ...] = ()
     levels: tuple[float, ...] = ()
-    relabelings: tuple[int, ...] = ()
     difference: float = math.nan
     interval: tuple[float, float] = (-1.0, math.inf)
     within_margin: bool = False
@@ -324,6 +323,7 @@ class PairDecision:
     leading: int = 0
     leading_difference: float = math.nan
     leading_interval: tuple[float, float] = (-1.0, math.inf)
+    relabelings: tuple[int, ...] = ()
 
     @property
     def differs(self) -> bool:

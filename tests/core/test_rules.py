@@ -107,7 +107,9 @@ def test_a_third_partys_rule_judges_pairs_and_boards(third_party: Callable[[type
     made = board.build(entries, rule=rule)
     assert (made.rule, made.promise) == ("half", Half.promise)
     assert made.as_dict()["rule"] == "half"
-    assert compare_entries(*entries, rule).rule == "half"
+    cells = compare_entries(*entries, rule).cells
+    assert cells is not None
+    assert cells.rule == "half"
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def test_entries_are_compared_at_what_both_have_reached(train: Train) -> None:
     assert first is not None
     assert second is not None
     compared = compare_entries(first, second)
-    assert compared.horizon == 180
+    assert compared.pair.times.horizon == 180
 
 
 def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -> None:
