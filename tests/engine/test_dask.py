@@ -99,7 +99,9 @@ def test_killed_again_and_again(kills: int, task: Path, cluster: Cluster, tmp_pa
             (status,) = survey(runs)
             assert ENDLESS in {g.progress.get("epochs") for g in status.groups if g.state == "running"}
             while sorted(seed for group in status.groups for seed in group.seeds) != list(range(SEEDS)):
-                assert run.poll() is None, run.communicate()[1]  # others are further before the last one begins
+                assert run.poll() is None, run.communicate()[
+                    1
+                ]  # others are further before the last one begins
                 (status,) = survey(runs)
         time.sleep(dice.uniform(0, 0.3))
         cluster.kill(dice.choice(cluster.workers))
