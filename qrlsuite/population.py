@@ -574,16 +574,20 @@ class Adam:
         self._population = population
         self._compiled = getattr(population, "compiled", False) is True
         first = self._named[0][1]
-        self.steps = torch.zeros(first.shape[0], dtype=torch.int64)
+        self.steps = torch.zeros(first.shape[0], dtype=torch.int64, device=first.device)
         self.mean = {name: torch.zeros_like(p) for name, p in self._named}
         self.square = {name: torch.zeros_like(p) for name, p in self._named}
         self._blocks: tuple[Any, ...] | None = None
+        self._on_device: dict[str, tuple[float | Tensor, Tensor]] = {}
+        """Learning rates by name, as they are in `rates` and on the device."""
 
     def decay(self, interactions: int, decay_steps: int | None) -> None:
         """Set the learning rates to what is left of the first ones after so many of `decay_steps` interactions."""
         if decay_steps is not None:
             left = max(0.0, 1.0 - interactions / decay_steps)
             self.rates = {name: rate * left for name, rate in self._first_rates.items()}
+            for name in self._on_device:  # also those that a captured step reads
+                self._rate(name)
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -593,18 +597,21 @@ class Adam:
     @torch.no_grad()
     def step(self, active: Tensor | None = None) -> None:
         """Move every agent, or only the ones with a true `active` (S,), along its gradient."""
-        self.steps += 1 if active is None else active.to(torch.int64)
-        if self._compiled and self._move(active):
+        self.steps += 1 if active is None else active.to(self.steps)
+        if self._compiled and self.steps.is_cpu and self._move(active):
             return
         beta1, beta2 = self.betas
-        count = self.steps.clamp(min=1).to(torch.float64)
-        scale = 1.0 / (1.0 - beta1**count)
-        root = 1.0 / torch.sqrt(1.0 - beta2**count)
+        count = self.steps.clamp(min=1)
+        if self.steps.is_cpu:
+            scale, root = _corrected(self.betas, count)
+        else:  # whose powers round differently
+            table = _correction_table(self.betas, self.steps.device)
+            scale, root = table[:, count.clamp(max=table.shape[1] - 1)]
         for name, parameter in self._named:
             if parameter.grad is None:
                 continue
             axes = (-1, *[1] * (parameter.dim() - 1))
-            rate = (self.rates[name] * scale).to(parameter).view(axes)
+            rate = (self._rate(name) * scale).to(parameter).view(axes)
             correction = root.to(parameter).view(axes)
             mean, square = self.mean[name], self.square[name]
             if active is None:
@@ -619,6 +626,19 @@ class Adam:
             parameter.copy_(torch.where(mask, parameter - change, parameter))
             mean.copy_(torch.where(mask, new_mean, mean))
             square.copy_(torch.where(mask, new_square, square))
+
+    def _rate(self, name: str) -> float | Tensor:
+        """Return a parameter's learning rate, on its device."""
+        rate = self.rates[name]
+        if self.steps.is_cpu:
+            return rate
+        if name not in self._on_device:
+            self._on_device[name] = rate, torch.as_tensor(rate, dtype=torch.float64).to(self.steps.device)
+        before, there = self._on_device[name]
+        if before is not rate:
+            there.copy_(torch.as_tensor(rate))
+            self._on_device[name] = rate, there
+        return there
 
     def _move(self, active: Tensor | None) -> bool:
         """Make the step in one compiled pass, for which parameters come to lie in one block; False if torch has to."""
@@ -689,7 +709,7 @@ class Adam:
             )  # each alone: the bits of an agent do not depend on others
             part = "gradient_norm_quantum" if name in self._quantum else "gradient_norm_classical"
             squares[part] = squares.get(part, 0.0) + own
-        weight = 1.0 - self.betas[1] ** self.steps.double().numpy()
+        weight = 1.0 - self.betas[1] ** self.steps.cpu().double().numpy()
         with np.errstate(divide="ignore", invalid="ignore"):
             norms = {part: np.sqrt(total / weight) for part, total in squares.items()}
         return {part: np.where(np.isfinite(norm), norm, np.nan) for part, norm in norms.items()}
@@ -713,6 +733,19 @@ class Adam:
 def _corrections(beta1: float, beta2: float, count: int) -> tuple[float, float]:
     """Return the bias corrections of Adam's moments after some steps: of the first, and of the root of the second."""
     return 1.0 / (1.0 - beta1**count), 1.0 / math.sqrt(1.0 - beta2**count)
+
+
+def _corrected(betas: tuple[float, float], count: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the corrections of Adam's moments after `count` steps, float64: of the first, and of the second's root."""
+    steps = count.to(torch.float64)
+    return 1.0 / (1.0 - betas[0] ** steps), 1.0 / torch.sqrt(1.0 - betas[1] ** steps)
+
+
+@functools.lru_cache(4)
+def _correction_table(betas: tuple[float, float], device: torch.device) -> Tensor:
+    """Return the corrections after 0, 1, ... steps, (2, N), as the CPU rounds them; the last ones are 1."""
+    steps = math.ceil(math.log(2.0**-54) / math.log(max(betas))) + 1
+    return torch.stack(_corrected(betas, torch.arange(steps))).to(device)
 
 
 def gradients(loss: Tensor, population: nn.Module) -> None:
@@ -740,6 +773,16 @@ def follow(target: nn.Module, population: nn.Module, tau: float) -> None:
     """Move a target network's parameters by `tau` of the way to the parameters of the network that it copies."""
     for slow, parameter in zip(target.parameters(), population.parameters()):
         slow.lerp_(parameter, tau)
+
+
+@torch.no_grad()
+def renew(target: nn.Module, population: nn.Module, steps: Tensor, every: Tensor) -> None:
+    """Copy agents into their target networks after every so many `steps`; both (S,) int64 on the networks' device."""
+    if steps.is_cpu and not (steps.numpy() % every.numpy() == 0).any():
+        return
+    due, online = steps % every == 0, population.state_dict()
+    for name, held in target.state_dict().items():
+        held.copy_(torch.where(due.view(-1, *[1] * (held.dim() - 1)), online[name], held))
 
 
 def by_seed(lanes: NDArray[Any], seeds: int, device: torch.device) -> Tensor:

@@ -26,19 +26,30 @@ class Replay:
     ----------
     rows:
         (S, capacity, numbers) float32; 0 where nothing was stored yet.
-    stored:
-        Rows ever stored, per seed.
     """
 
     def __init__(self, seeds: int, capacity: int, device: torch.device, **columns: int) -> None:
         self.columns = columns
         self.rows = torch.zeros((seeds, capacity, sum(columns.values())), device=device)
-        self.stored = 0
+        self._stored = 0
+        self._count = None if self.rows.is_cpu else torch.zeros((), dtype=torch.int64, device=device)
+        """`stored` on the device, where rounds read it."""
         self._borders = [0, *itertools.accumulate(columns.values())]
         blocks = list(zip(self._borders, columns.values()))
         self._starts, self._within, self._widths = np.array(
             [(first, column, width) for first, width in blocks for column in range(width)], np.uint64
         ).T.copy()
+
+    @property
+    def stored(self) -> int:
+        """Rows ever stored, per seed."""
+        return self._stored
+
+    @stored.setter
+    def stored(self, rows: int) -> None:
+        self._stored = rows
+        if self._count is not None:
+            self._count.fill_(rows)
 
     @property
     def filled(self) -> int:
@@ -56,8 +67,11 @@ class Replay:
         else:
             parts = [values[name].to(torch.float32) for name in self.columns]
             both = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
-            self.rows[:, (self.stored + torch.arange(new)) % capacity] = both
-        self.stored += new
+            first: int | Tensor = self._stored if self._count is None else self._count
+            self.rows[:, (first + torch.arange(new, device=self.rows.device)) % capacity] = both
+        self._stored += new
+        if self._count is not None:
+            self._count += new
 
     def batch(self, draws: Tensor) -> dict[str, Tensor]:
         """Return rows of every seed, each quantity (S, B, numbers), contiguous.
@@ -67,7 +81,8 @@ class Replay:
         draws:
             (S, B) float64, uniform in [0, 1): they choose stored rows, with replacement.
         """
-        return self.at((draws * self.filled).to(torch.int64))
+        filled = self.filled if self._count is None else self._count.clamp(max=self.rows.shape[1])
+        return self.at((draws * filled).to(torch.int64))
 
     def at(self, places: Tensor) -> dict[str, Tensor]:
         """Return the rows at `places` (S, B) of every seed, as `batch` does."""

@@ -35,7 +35,7 @@ from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import Adam, DecaySteps, by_seed, chosen_errors, chosen_values, part, prefixed
+from qrlsuite.population import Adam, DecaySteps, by_seed, chosen_errors, chosen_values, part, prefixed, renew
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
@@ -100,9 +100,8 @@ class DDQN:
         self.online = build_model(self.actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = Adam(self.online, options.lr, options.quantum_lr)
-        self.epsilon, self.target_steps = (  # (S,)
-            np.broadcast_to(np.asarray(each), self.S) for each in (options.epsilon, options.target_steps)
-        )
+        self.epsilon = np.broadcast_to(np.asarray(options.epsilon), self.S)
+        self.target_steps = torch.as_tensor(options.target_steps).long().expand(self.S).to(device)
         self.epoch = 0
         self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
 
@@ -173,11 +172,7 @@ class DDQN:
         )
         errors = chosen_errors(self.online, seen, action.long(), y)  # Q(s, a) - y; sets gradients
         self.adam.step()
-        due = int(self.adam.steps[0]) % self.target_steps == 0
-        if due.any():
-            agents, online = torch.from_numpy(np.flatnonzero(due)).to(self.device), self.online.state_dict()
-            for name, held in self.target.state_dict().items():
-                held[agents] = online[name][agents]
+        renew(self.target, self.online, self.adam.steps, self.target_steps)
         return errors.square().mean(1)
 
     def _greedy(self, seen: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
+from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, renew, unroll
 from qrlsuite.seeding import Streams
 
 
@@ -94,6 +94,7 @@ class DRQN:
         self.online = build_model(self.actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = Adam(self.online, options.lr, options.quantum_lr)
+        self.target_steps = torch.full((self.S,), options.target_steps, device=device)
         self.L = options.burn_in + options.length
         self.capacity = max(options.buffer // self.E, self.L)  # rounds
         self.stored = 0  # rounds ever stored
@@ -215,8 +216,7 @@ class DRQN:
         self.adam.zero_grad()
         torch.autograd.backward(losses.sum())
         self.adam.step()
-        if int(self.adam.steps[0]) % o.target_steps == 0:
-            self.target.load_state_dict(self.online.state_dict())
+        renew(self.target, self.online, self.adam.steps, self.target_steps)
         detached: Tensor = losses.detach().to(torch.float64)
         return detached
 

@@ -27,6 +27,7 @@ import qrlsuite
 from qrlsuite import actions as action_spaces
 from qrlsuite import own, population, registry, specs
 from qrlsuite.circuit import CircuitModel
+from qrlsuite.device import LateChecks
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry
@@ -521,7 +522,7 @@ class Trainer:
         self.device = find_device(device)
         self.progress = Progress()
         self.epoch = 0
-        self._warm = False
+        self._warm, self._checks = False, LateChecks()
         protocol = entry.task.file.protocol
         self.S, self.E, self.V = len(self.seeds), protocol.environments, protocol.validation_episodes
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
@@ -620,7 +621,8 @@ class Trainer:
         self._phase("training", rounds)
         if self.statistics is not None:
             self.statistics.adopt()
-        metrics = dict(self.algorithm.train_epoch(rounds))
+        with self._checks:
+            metrics = dict(self.algorithm.train_epoch(rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained, between = time.perf_counter(), self.models.executions()
         self.progress.warnings += [p for p in self.models.problems() if p not in self.progress.warnings]
@@ -730,7 +732,8 @@ class Trainer:
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
         self.validation.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
         try:
-            episodes = play_episodes(self.validation, lambda: self.act)
+            with self._checks:
+                episodes = play_episodes(self.validation, lambda: self.act)
         finally:
             with torch.no_grad():
                 for buffer, value in zip(buffers, before):

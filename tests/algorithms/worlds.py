@@ -72,6 +72,7 @@ class Group:
         envs: LaneEnv,
         model: str = "mlp",
         model_options: Mapping[str, Any] | None = None,
+        device: str = "cpu",
         **settings: Any,
     ) -> None:
         self.seeds, self.envs = list(seeds), envs
@@ -91,7 +92,7 @@ class Group:
             self._build,
             options.build(specs.resolve(spec.options), settings, "algorithm"),
             self.streams,
-            torch.device("cpu"),
+            torch.device(device),
         )
 
     def _build(self, outputs: int, inputs: int | None = None, role: str = "network") -> nn.Module:

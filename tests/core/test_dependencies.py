@@ -18,7 +18,7 @@ FOLDERS = {
     "qrlsuite.leaderboard": ROOT / "leaderboard",
 }
 TOP = {
-    "actions", "algorithm", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization",
+    "actions", "algorithm", "device", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization",
     "masks", "notation", "options", "own", "population", "registry", "replay", "seeding", "shortforms",
     "specs", "columns",
 }  # fmt: skip

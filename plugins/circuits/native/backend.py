@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from qrlsuite.circuit import Circuit
+from qrlsuite.device import LateChecks
 from qrlsuite.errors import CircuitError, OptionError
 from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.plugins.circuits.native.program import Program, compile_circuit
@@ -90,7 +91,9 @@ class NativeBackend:
             return self._sampler(inputs.cpu(), there, seeds).to(inputs)
         flat = self._flat(inputs, parameters)
         result = self._run(inputs, flat)
-        if not bool(torch.isfinite(result.detach().sum())):
+        finite = torch.isfinite(result.detach().sum())
+        late = not result.is_cpu and LateChecks.note(self, finite, _refused)
+        if not late and not bool(finite):
             raise OptionError(_cause(inputs, flat))
         return result
 
@@ -227,6 +230,13 @@ def _check(options: NativeOptions, circuit: Circuit) -> None:
             "the mean-field approximation of a circuit is none, so it has no shots, noise or gradient rule; leave out "
             "shots, noise_model and gradient"
         )
+
+
+def _refused() -> OptionError:
+    """Return the refusal of values that were found in an epoch on a device: the inputs are no more."""
+    return OptionError(
+        f"{NOT_FINITE}, or an angle is too large: make learning rates or initial parameters smaller"
+    )
 
 
 def _cause(inputs: Tensor, flat: Tensor) -> str:

@@ -104,11 +104,11 @@ def _angles(program: Program | MeanFieldProgram, inputs: Tensor, flat: Tensor) -
     table = torch.from_numpy(program.angles).to(inputs.device)
     angles = torch.from_numpy(program.constants).to(inputs).expand(*inputs.shape[:2], -1)
     which, scale, weight = table.T
-    if bool((which >= 0).any()):
+    if (program.angles[:, 0] >= 0).any():
         x = inputs[..., which.clamp(min=0)]
         factor = torch.where(scale >= 0, _pick(flat, scale), torch.ones_like(inputs[:, :1, :1]))
         angles = angles + torch.where(which >= 0, x * factor, torch.zeros_like(x))
-    if bool((weight >= 0).any()):
+    if (program.angles[:, 2] >= 0).any():
         angles = angles + torch.where(weight >= 0, _pick(flat, weight), torch.zeros_like(flat[:, None, :1]))
     return angles
 
