@@ -21,7 +21,7 @@ from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.studies.looks import Study, has_begun
+from qrlsuite.studies.looks import FILE, Study, has_begun
 from qrlsuite.studies.runner import Overview
 from qrlsuite.studies.state import State
 from qrlsuite.studies.study import EvaluationSection, Member, PictureSection, StudyFile, load
@@ -45,6 +45,9 @@ def find(name: str) -> StudyFile:
             known = [*files, *registered, *published_studies.names()]
             raise UnknownNameError(f"unknown study '{name}'{nearest(name, files or known)}")
         return published_studies.load(folder).of(name)
+    path = Path(name)
+    if path.name == FILE and any(path.parent.glob("*/*/entry.json")):  # results, which may be a stranger's
+        return published_studies.load(path.parent).of(name)
     study = load(name)
     check(study)
     return study

@@ -97,7 +97,7 @@ class PairVerdict:
         Environment steps at which the task's first board ranks.
     before:
         The side of a threshold where a run has not reached it: `below`, or `above`.
-    provisional:
+    incomplete:
         Whether seeds that were asked for are missing.
     """
 
@@ -110,7 +110,7 @@ class PairVerdict:
     adjusted: bool = False
     whole: int = 0
     before: str = "below"
-    provisional: bool = False
+    incomplete: bool = False
 
     @property
     def sentence(self) -> str:
@@ -118,7 +118,7 @@ class PairVerdict:
         said = self.said
         if self.times.horizon < self.whole:
             said = f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {said}"
-        return f"provisional: {said}" if self.provisional else said
+        return f"incomplete: {said}" if self.incomplete else said
 
     @property
     def said(self) -> str:
@@ -320,7 +320,7 @@ def judge_pair(
         by=by,
         whole=min(ranking_of([first, second]).horizons),
         before=grid.before,
-        provisional=bool(first.missing or second.missing),
+        incomplete=bool(first.missing or second.missing),
     )
 
 

@@ -49,7 +49,7 @@ def learning_curves(entry: EntryResults) -> LearningCurves:
 
 def unranked_since(entry: EntryResults) -> str:
     """Return why a board ranks an entry no better: its seeds are missing, or too few."""
-    return "provisional: seeds are missing" if entry.missing else TOO_FEW
+    return "incomplete: seeds are missing" if entry.missing else TOO_FEW
 
 
 WITH_LOOKS = (

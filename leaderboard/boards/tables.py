@@ -277,7 +277,7 @@ def _failed(entries: Sequence[EntryResults], horizon: int | None) -> dict[str, i
 def missing(entries: Sequence[EntryResults]) -> list[str]:
     """Name the seeds that were asked for and are not there, with what to do, and the requests that were withdrawn."""
     notes = {
-        "provisional, without rank until these seeds are trained (`qrlsuite run`) or withdrawn (`qrlsuite runs rm "
+        "incomplete, without rank until these seeds are trained (`qrlsuite run`) or withdrawn (`qrlsuite runs rm "
         "ENTRY --seeds`)": {entry.label: entry.missing_text for entry in entries if entry.missing},
         "seeds that were asked for, and withdrawn": {
             entry.label: "; ".join(

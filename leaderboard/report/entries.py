@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +29,7 @@ class EntryView:
     Attributes
     ----------
     palette:
-        Numbers of the colors of its task's entries by name: who is asked first has the first.
+        Numbers of the colors of its task's entries by name, see `paint`.
     legend:
         The label, with the ansatz if there is one.
     facts:
@@ -52,7 +52,7 @@ class EntryView:
     @property
     def color(self) -> int:
         """Number of its color and pattern in every section and picture of the page."""
-        return self.palette.setdefault(self.curves.name, len(self.palette))
+        return self.palette[self.curves.name]
 
     @property
     def quantum(self) -> bool:
@@ -79,6 +79,12 @@ def views(entries: Sequence[EntryResults]) -> list[EntryView]:
         )
         for index, (entry, (task, label)) in enumerate(zip(entries, labels))
     ]
+
+
+def paint(entries: Iterable[EntryView]) -> None:
+    """Give entries without a color the next ones of their task; the first colors differ most."""
+    for entry in entries:
+        entry.palette.setdefault(entry.curves.name, len(entry.palette))
 
 
 def _facts(entry: EntryResults) -> list[tuple[str, str]]:

@@ -60,6 +60,7 @@ def render(
     tasks = dict.fromkeys(section.task for section in board.sections)
     each_task = [[section for section in board.sections if section.task == task] for task in tasks]
     main = [boards[board.sections.index(main_section(each))] for each in each_task]
+    entries.paint(shown)
     scripts = [_file(name) for name in (*SCRIPTS, *[LIVE] * live)]
     data = {"entries": entries.curves_data(shown), "sections": [view.data for view in boards]}
     now = datetime.datetime.now(datetime.UTC)

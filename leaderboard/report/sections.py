@@ -19,7 +19,7 @@ from qrlsuite.leaderboard.boards.times import TimeRanking
 from qrlsuite.leaderboard.report import ladder
 from qrlsuite.leaderboard.report.cite import Citation, cite
 from qrlsuite.leaderboard.report.encode import clean
-from qrlsuite.leaderboard.report.entries import EntryView, changed_options
+from qrlsuite.leaderboard.report.entries import EntryView, changed_options, paint
 from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.rows import RowView
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
@@ -110,8 +110,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         return f"{said}.".replace("p = ", "p\u00a0=\u00a0").replace("p < ", "p\u00a0<\u00a0")
 
     picked = sorted({row.place for pair in asked for row in pair} or {row.place for row in rows[:3]})
-    for place in picked:  # the first colors differ most
-        _ = rows[place].entry.color
+    paint(rows[place].entry for place in picked)
     return SectionView(
         id=f"board-{number}",
         number=number,

@@ -445,7 +445,7 @@ class EntryResults(Shown):
             "parameters": self.parameters_text(" quantum"),
             "seeds": f"{n_runs}"
             + (f", {len(self.left_out)} unfinished left out" if self.left_out else "")
-            + (f"; provisional: {self.missing_text}" if self.missing else "")
+            + (f"; incomplete: {self.missing_text}" if self.missing else "")
             + (f", {len(self.diverged)} diverged" if self.diverged else ""),
             **({"left out": "; ".join(self.refused)} if self.refused else {}),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",

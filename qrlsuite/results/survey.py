@@ -246,7 +246,6 @@ class GroupStatus:
         if running and self.seconds_left is not None:
             parts.append(f"{duration(self.seconds_left)} left")
         parts += [self.where] if self.where != "nobody" else []
-        parts += ["continued by the same `qrlsuite run`"] if self.state == "stopped" else []
         parts += [str(error)] if error else []
         return "  ".join(parts)
 

@@ -298,9 +298,14 @@ class State(Shown):
     def sheets(self) -> list[Sheet]:
         """Return a table of pairs for each question."""
         pairs = list(zip(self.pairs, self.as_dict()["pairs"]))
+        questions = by_question(self.study, pairs)
         return [
-            replace(_sheet(self, of), title=asked or self.study.file.summary, label=self.study.name)
-            for asked, of in by_question(self.study, pairs)
+            replace(
+                _sheet(self, of),
+                title=asked or self.study.file.summary,
+                label=self.study.name + f"-{number}" * (len(questions) > 1),
+            )
+            for number, (asked, of) in enumerate(questions, 1)
         ]
 
     def late(self, pair: PairDecision) -> bool:
@@ -428,7 +433,7 @@ def horizon_note(outcome: State) -> str:
 
 def lost_note(outcome: State) -> str:
     """Say which seeds were asked for and are not there, and that the log is gone; empty where all is there."""
-    notes = [f"provisional: {told} ({name})" for name, told in outcome.lost.items()]
+    notes = [f"incomplete: {told} ({name})" for name, told in outcome.lost.items()]
     if outcome.begun and outcome.begun_at is None:
         notes.append("its log is gone: nobody can see when it began, or who has seen its seeds before")
     return "; ".join(notes)

@@ -6,8 +6,9 @@ A tracker has any of these methods, which are called in the worker that trains:
     epoch_finished(run, record)  `record` is the epoch's line of `epochs.jsonl`
     run_finished(run)            the last epoch is done; all results are on disk
 
-`run` is the seed's `run.json` and its `folder`; `run_started` is given `epochs` and `history` too, the number of the
-finished epochs and their records. Epochs after a run's last checkpoint come a second time when it goes on.
+`run` is the seed's `run.json` and its `folder`, `RESULTS/TASK/ENTRY/SEED`; `run_started` is given `epochs` and
+`history` too, the number of the finished epochs and their records. Epochs after a run's last checkpoint come a second
+time when it goes on.
 
 Trackers whose spec says `always` watch every run, others only runs that ask for them: workers read the environment
 variable `QRLSUITE_TRACK`, which `qrlsuite run --track` sets.

@@ -22,6 +22,8 @@ import pytest
 
 from qrlsuite import api, registry, specs
 from qrlsuite.cli import main
+from qrlsuite.cli.commands.runs import _unfinished
+from qrlsuite.engine.status import EntryStatus
 from qrlsuite.engine.work import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError
@@ -33,6 +35,7 @@ from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.results.records import RunRecord
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
+from qrlsuite.results.survey import GroupStatus
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies.looks import Study
 from qrlsuite.studies.state import needs_text
@@ -211,6 +214,13 @@ def test_ctrl_c_between_groups_changes_no_decision() -> None:
         assert (len(rows), "  none of 20  " in rows[-1]) == (min(interrupted + 1, 3), interrupted == 1)
         assert run(*words)["pairs"] == straight["pairs"]
         assert len(Scripted.trained) == 5, "nothing is trained twice"
+
+
+def test_a_stopped_group_names_the_command_that_goes_on() -> None:
+    groups = (GroupStatus((0, 1), "stopped", "nobody"),)
+    for study, command in ((None, "run"), ("widths", "study run")):
+        (line,) = _unfinished(EntryStatus(SimpleNamespace(), groups, study=study))  # type: ignore[arg-type]
+        assert line.endswith(f"seeds 0:2  continued by the same `qrlsuite {command}`")
 
 
 def test_a_study_goes_on_with_the_code_that_began_it(
@@ -461,9 +471,9 @@ def test_seeds_that_a_study_lost_are_named() -> None:
     shutil.rmtree(store.seed(10003).path)
     said = "1 of 20 seeds is missing: 10003"
     assert answer("show", "widths.toml")["lost"] == {"mlp width=16": said}
-    assert f"provisional: {said} (mlp width=16)" in say("show", "widths.toml").stdout
+    assert f"incomplete: {said} (mlp width=16)" in say("show", "widths.toml").stdout
     read = studies.read_outcome("widths.toml", Path("runs"))
-    assert looks_report.view(read)["note"].startswith(f"provisional: {said}")
+    assert looks_report.view(read)["note"].startswith(f"incomplete: {said}")
     (folder / "looks.jsonl").unlink()
     assert "its log is gone" in say("show", "widths.toml").stdout
 

@@ -259,7 +259,8 @@ reason = "a test"
     for exported in ("walk", "walks.toml"):
         assert commands.qrlsuite("export", exported, "--out", "out").returncode == 0
     assert commands.qrlsuite("import", "out/walks", "--runs", "third").returncode == 0
-    assert "found in a results folder" in commands.qrlsuite("study", "run", "out/walks").stderr
+    for place in ("out/walks", "out/walks/plan.toml"):
+        assert "found in a results folder" in commands.qrlsuite("study", "run", place).stderr
     store = the_entry(walk / "runs")
     shutil.rmtree(store.seed(0).path)
     shutil.rmtree(next(walk.glob("runs/decisions/walks/*/*/seed-10001")))
@@ -271,7 +272,8 @@ reason = "a test"
     command = f"{sys.executable} walk.py {{seed}} {{steps}} 0.5"  # of the same files
     other = {"folder": str(walk), "command": command, "steps": 100, "curve": "curve-{seed}.csv"}
     assert commands.start_worker(str(store.path), *worker, "--script", json.dumps(other)).wait() == 2
-    assert "found in a results folder" in commands.qrlsuite("study", "run", "runs/decisions/walks").stderr
+    for place in ("runs/decisions/walks", "runs/decisions/walks/plan.toml"):
+        assert "found in a results folder" in commands.qrlsuite("study", "run", place).stderr
     for typed in (
         ["import", "runs", "--runs", "copy"],
         ["verify", "out", "--rerun", "1"],

@@ -121,7 +121,11 @@ def test_what_is_not_a_number_is_packed_as_missing() -> None:
 
 def test_a_large_board_carries_a_selection_of_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(entries, "SINGLE_RUNS", 1000)
-    data = entries.curves_data(entries.views(boards.graded(4)))
+    views = entries.views(boards.graded(4))
+    entries.paint(views[2:])
+    entries.paint(views)
+    assert [view.color for view in reversed(views)] == [1, 0, 3, 2], "reading a color gives none"
+    data = entries.curves_data(views)
     assert [entry["kept"] for entry in data] == [2] * 4
     assert sum(len(entry["single"]) for entry in data) <= 2 * 1000
 

@@ -1,4 +1,4 @@
-"""A verdict names the seeds that were asked for and are not there, and is provisional until they are."""
+"""A verdict names the seeds that were asked for and are not there, and is incomplete until they are."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def lose(runs: Path, width: int, *seeds: int) -> EntryStore:
 SAID = "4 of 24 seeds are missing: 6, 7, 9, 18"
 
 
-def test_deleted_seeds_make_every_verdict_provisional(runs: Path, tmp_path: Path) -> None:
-    assert "provisional" not in say("compare", "mlp width=8", "mlp width=16", "--runs", str(runs)).stdout
+def test_deleted_seeds_make_every_verdict_incomplete(runs: Path, tmp_path: Path) -> None:
+    assert "incomplete" not in say("compare", "mlp width=8", "mlp width=16", "--runs", str(runs)).stdout
     lose(runs, 8, 6, 7, 9, 18)
     compared = say("compare", "mlp width=8", "mlp width=16", "--runs", str(runs)).stdout
-    assert compared.startswith("provisional: ")
+    assert compared.startswith("incomplete: ")
     assert SAID in " ".join(compared.split())
     assert SAID in answer("compare", "mlp width=8", "mlp width=16", "--runs", str(runs))["notes"][0]
     for axis in ("steps", "executions", "core-hours", "score", "area"):
@@ -103,7 +103,7 @@ def test_a_withdrawn_request_is_named_with_its_reason(runs: Path, tmp_path: Path
     note = "seeds that were asked for, and withdrawn: mlp width=8 (6:8: the disk failed)"
     compared = api.compare("mlp width=8", "mlp width=16", runs=runs)
     assert note in " ".join(compared.further).replace("ddqn ", "")
-    assert not compared.sentence.startswith("provisional")
+    assert not compared.sentence.startswith("incomplete")
     say("export", "mlp width=8", "--runs", str(runs), "--out", str(tmp_path / "out"))
     (folder,) = (tmp_path / "out" / "tiny").iterdir()
     assert published.read(folder).entry_results().withdrawn == {6: "the disk failed", 7: "the disk failed"}
@@ -129,14 +129,14 @@ def test_seeds_at_work_are_still_training(runs: Path) -> None:
     claim.release()
 
 
-def test_a_run_that_was_stopped_is_provisional_until_it_is_continued(runs: Path) -> None:
+def test_a_run_that_was_stopped_is_incomplete_until_it_is_continued(runs: Path) -> None:
     store = EntryStore.create(runs, resolve("tiny.toml", "mlp width=4"))
     requests.add(store, range(20), 3, code="code")
     train_group(store.path, range(20), 2)
     entry = api.load("mlp width=4", runs=runs)
     assert (entry.epochs, len(entry.seeds), len(entry.missing)) == (2, 20, 20)
     assert api.compare("mlp width=4", "mlp width=8", runs=runs).sentence.startswith(
-        "provisional: after 120 of 180"
+        "incomplete: after 120 of 180"
     )
     (section,) = api.board(runs=runs, horizon=120).sections
     assert {row.entry.label: row.time.rank_text for row in section.rows}["ddqn mlp width=4"] == "-"

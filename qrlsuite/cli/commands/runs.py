@@ -200,4 +200,6 @@ def _unfinished(status: EntryStatus) -> list[str]:
     """Return a line for each group of an entry that has not finished."""
     problem = status.queue_problem
     silent = [f"the queue was not asked, seeds may have left it: {problem}"] if problem else []
-    return [f"  {line}" for line in (*silent, *(group.text for group in status.groups))]
+    again = f"  continued by the same `qrlsuite {'study run' if status.study else 'run'}`"
+    lines = (group.text + again * (group.state == "stopped") for group in status.groups)
+    return [f"  {line}" for line in (*silent, *lines)]
