@@ -631,6 +631,8 @@ def _tuned_text(tuning: Mapping[str, Any]) -> str:
             known.append(counted(len(parse_seeds(tuning["seeds"])), "seed"))
     if tuning.get("regret") is not None:
         known.append(f"regret {tuning['regret']['expected']:.0%}")
+    if tuning.get("last") is not None:
+        known.append(f"{tuning['last']['expected']:.0%} among the last {len(tuning['last']['values'])}")
     changed = [name.partition(".")[2] for name in tuning.get("changed") or ()]
     text = f"tuned ({', '.join(known)})" if known else "tuned"
     return f"{text} but {', '.join(changed)}" if changed else text

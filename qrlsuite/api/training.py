@@ -238,7 +238,8 @@ def tune(
         mark as `Tuned`.
     sampler:
         `bayesian`, `grid` or `random`, with options `trials` and `seed`: `"random trials=50"`;
-        `"bayesian regret=.03"`. None takes all combinations of the lists in `vary`, and `bayesian` without lists.
+        `"bayesian regret=.03 last=100"`, whose best three settings are compared on `last` other seeds. None takes all
+        combinations of the lists in `vary`, and `bayesian` without lists.
     seeds:
         Runs of each trial: a number counts from seed 1,000,000. None takes 20, with `bayesian` 4.
     epochs:

@@ -34,6 +34,22 @@ class RegretRecord(options.Table):
     near: Annotated[float, Field(ge=0, le=1, description="probability of a regret of at most 0.03")]
 
 
+class LastRoundRecord(options.Table):
+    """The last round of a search: its best settings on seeds that no other trial had, and the best there taken."""
+
+    seeds: Annotated[str, Field(max_length=10_000, description="as --seeds reads them")]
+    values: Annotated[
+        tuple[Annotated[float, Field(ge=0)], ...],
+        Field(min_length=1, max_length=100, description="objective in steps, from best to worst"),
+    ]
+    expected: Annotated[float, Field(ge=0, description="regret of the settings found among these, a share")]
+    low: Annotated[float, Field(ge=0, description="5th percentile")]
+    high: Annotated[float, Field(ge=0, description="95th percentile")]
+
+
+_LATER = ("regret", "last")
+
+
 class TuningRecord(options.Table):
     """How settings were found, and at which cost; None is unknown."""
 
@@ -57,6 +73,7 @@ class TuningRecord(options.Table):
         Field(description="successive halving, in older records: settings and seeds of each rung"),
     ] = None
     regret: RegretRecord | None = None
+    last: LastRoundRecord | None = None
     epochs: Annotated[int | None, Field(ge=1, description="of every trial")] = None
     steps: Annotated[int | None, Field(ge=0, description="environment steps of all trials together")] = None
     space: Annotated[dict[str, Any] | None, Field(description="values or range of every option")] = None
@@ -71,10 +88,10 @@ class TuningRecord(options.Table):
     ] = False
 
     @model_serializer(mode="wrap")
-    def _without_regret(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `regret` out where it is not known: hashes of older studies cover records without it."""
+    def _without_unknown(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what is not known and came later: hashes of older studies cover records without it."""
         content: dict[str, Any] = write(self)
-        return {name: value for name, value in content.items() if (name, value) != ("regret", None)}
+        return {name: value for name, value in content.items() if name not in _LATER or value is not None}
 
     @model_validator(mode="before")
     @classmethod

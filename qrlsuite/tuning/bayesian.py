@@ -3,7 +3,8 @@
 Settings are chosen by `qrlsuite.tuning.surrogate`. First come the untuned setting, settings given by hand, and a few
 spread over the ranges (a Halton sequence); then, twelve at a time, settings that may be the best, new or tried before.
 Each time they are trained on seeds that no setting had before, to the whole horizon: poor settings get fewer seeds, and
-never fewer epochs, which would favor settings that begin fast.
+never fewer epochs, which would favor settings that begin fast. In a last round, the best three are trained on many
+seeds that no setting had, and the best one there is chosen: the best of many trials of a few seeds had luck.
 
 Regret is how much longer than at the best settings learning takes at the chosen ones. Several models that are searched
 until the same regret are compared fairly, though one may need more trials than another.
@@ -32,6 +33,12 @@ from qrlsuite.tuning.space import Dimension, Point, Range
 PER_OPTION = 40
 """Trials for each varied option, at most, unless told otherwise."""
 
+FINALISTS = 3
+"""Settings in the last round."""
+
+LAST_SEEDS = 100_000
+"""The seeds of the last round begin as many numbers after those of the first: no other trial has them."""
+
 
 class Bayesian(Search):
     """One search; see the module.
@@ -42,6 +49,8 @@ class Bayesian(Search):
         The ranges with their extensions, by option.
     taken:
         Settings given by hand that set only varied options.
+    last:
+        The trials of the last round from best to worst; empty before it has ended.
     """
 
     def _begin(self) -> None:
@@ -74,6 +83,7 @@ class Bayesian(Search):
             shared=[i for i, d in enumerate(self.space) if d.name in self._coarse],
         )
         self._latest: dict[int, Trial] = {}
+        self.last: list[Trial] = []
         self._steps = self._proposals()
         self._next = next(self._steps)
         self._tried_now: list[Trial | None] = []
@@ -149,9 +159,25 @@ class Bayesian(Search):
     @property
     def planned(self) -> int:
         """How many trials there are to be, at most; settings that get more seeds count again."""
+        return self._limit + FINALISTS * bool(self.request.last)
+
+    @property
+    def runs_planned(self) -> int:
+        """How many runs, each of one seed, all planned trials take."""
+        return self._limit * len(self.request.seeds) + FINALISTS * self.request.last
+
+    @property
+    def next_seeds(self) -> int:
+        """How many seeds the next trial has."""
+        return len(self._next[0].seeds) if self._next else len(self.request.seeds)
+
+    @property
+    def _limit(self) -> int:
+        """How many trials there are before the last round, at most."""
         pace = self._pace
         if self.request.core_hours is not None and self.request.trials is None and pace:
-            return max(self.asked, int(3600 * self.request.core_hours / (pace * len(self.request.seeds))))
+            runs = 3600 * self.request.core_hours / pace - FINALISTS * self.request.last
+            return max(self.asked, int(runs / len(self.request.seeds)))
         return (self.request.trials or PER_OPTION) * len(self.space)
 
     @property
@@ -174,7 +200,8 @@ class Bayesian(Search):
         """Say until when settings are tried."""
         count, seeds = len(self.space), counted(len(self.request.seeds), "seed")
         return (
-            f"{counted(count, 'option')}, until {self.budget_text}: at most {self.planned} trials of {seeds}"
+            f"{counted(count, 'option')}, until {self.budget_text}: at most {self._limit} trials of {seeds}"
+            + f", then the best {FINALISTS} on {counted(self.request.last, 'seed')}" * bool(self.request.last)
         )
 
     @property
@@ -190,7 +217,7 @@ class Bayesian(Search):
     @property
     def behind(self) -> bool:
         """Whether the untuned settings were measured to be better than the chosen ones."""
-        untuned, best = self._latest.get(0), self.best
+        untuned, best = self._latest.get(0), next(iter(self._by_surrogate), None)
         return untuned is not None and best is not None and untuned.merit.signal < best.merit.signal
 
     @property
@@ -246,7 +273,20 @@ class Bayesian(Search):
                 np.array([len(trial.seeds) for trial in latest], np.float64),
             )
             last += 1
+        if self.request.last:
+            finalists = self._finalists(last)
+            yield finalists
+            self.last = sorted(self.trials[-len(finalists) :], key=lambda trial: trial.merit.order)
         yield []
+
+    def _finalists(self, last: int) -> list[Proposal]:
+        """Propose the last round: the settings that the surrogate has as the best, on seeds of their own."""
+        first = self.request.seeds[0] + LAST_SEEDS
+        seeds = tuple(range(first, first + self.request.last))
+        best = [trial.number for trial in self._by_surrogate[:FINALISTS]]
+        if self.behind and 1 not in best:
+            best[-1] = 1
+        return [Proposal(number, self._point(self._climb.tried[number - 1]), seeds, last) for number in best]
 
     def _seen(self, number: int) -> tuple[int, ...]:
         return self._latest[number].seeds if number in self._latest else ()
@@ -258,10 +298,10 @@ class Bayesian(Search):
             return 0
         hours, trials = self.request.core_hours, surrogate.BATCH
         if hours is not None and self.asked:
-            left = 3600 * hours - self.core_seconds
+            left = 3600 * hours - self.core_seconds - self._pace * FINALISTS * self.request.last
             trials = int(left / (self._pace * len(self.request.seeds))) if self._pace else trials
         if (hours is None or self.request.trials is not None) and self.asked:
-            trials = min(trials, self.planned - self.asked)
+            trials = min(trials, self._limit - self.asked)
         return max(trials, 0)
 
     def _spread(self, curves: surrogate.Floats, worth: Callable[[surrogate.Floats], Merit]) -> float:
@@ -275,7 +315,12 @@ class Bayesian(Search):
 
     @property
     def ordered(self) -> list[Trial]:
-        """The settings from best to worst by the surrogate, each on all its seeds."""
+        """The settings from best to worst: by the last round, then by the surrogate, each on all its seeds."""
+        again = {trial.number for trial in self.last}
+        return [*self.last, *(trial for trial in self._by_surrogate if trial.number not in again)]
+
+    @property
+    def _by_surrogate(self) -> list[Trial]:
         known = [self._latest[number] for number in self._climb.order if number in self._latest]
         return known or sorted(self.trials, key=lambda trial: (trial.merit.order, trial.number))
 
@@ -298,7 +343,24 @@ class Bayesian(Search):
                 f"within {surrogate.NEAR:.0%} of the best with probability {regret.near:.0%}",
                 *([f"nothing was tried beyond the best {edges}"] if edges else []),
                 *(["the untuned settings were measured to be better"] if self.behind else []),
+                *([self._last_text] if self.last else []),
             ]
+        )
+
+    @property
+    def _last_text(self) -> str:
+        return (
+            f"the best of {len(self.last)} on {self.request.last} seeds each, with an expected regret among them of "
+            f"{self._regret_among.expected:.1%}"
+        )
+
+    @property
+    def _regret_among(self) -> surrogate.Regret:
+        """The regret of the chosen settings among those of the last round."""
+        return surrogate.regret_among(
+            np.array([max(trial.merit.signal, 1.0) for trial in self.last]),
+            np.array([trial.spread for trial in self.last]),
+            np.array([len(trial.seeds) for trial in self.last], np.float64),
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -310,8 +372,8 @@ class Bayesian(Search):
         """Return the record of the choice of settings."""
         regret = self._climb.regret
         return {
-            "trials": len(self.trials),
-            "planned": self.planned if self.request.core_hours is None else None,
+            "trials": len(self.trials) - len(self.last),
+            "planned": self._limit if self.request.core_hours is None else None,
             "space": {d.name: replace(d, range=self.searched.get(d.name)).plain() for d in self.space},
             "budget": self.budget_text,
             "regret": None
@@ -323,8 +385,23 @@ class Bayesian(Search):
                 high=regret.high,
                 near=regret.near,
             ),
-            "note": self.regret_text,
+            "last": self._last_record() if self.last else None,
+            "note": "; ".join([self.regret_text, *["the last round is missing"] * self._lacks_last]),
         }
+
+    def _last_record(self) -> preset.LastRoundRecord:
+        regret = self._regret_among
+        return preset.LastRoundRecord(
+            seeds=format_seeds(self.last[0].seeds),
+            values=tuple(trial.merit.value for trial in self.last),
+            expected=regret.expected,
+            low=regret.low,
+            high=regret.high,
+        )
+
+    @property
+    def _lacks_last(self) -> bool:
+        return bool(self.request.last) and not self.last
 
     def _sampler_key(self) -> list[Any]:
         return [self.request.sampler, self.request.sampler_seed, list(self.request.rows)]
@@ -332,7 +409,8 @@ class Bayesian(Search):
     @property
     def _warning(self) -> str:
         said = f"First row: {self.regret_text}" if self.regret_text else "No regret is known yet"
-        return f"{said}. Rows are ordered by the surrogate, which knows all trials"
+        rows = "The last round's rows come first, and others are" if self.last else "Rows are"
+        return f"{said}. {rows} ordered by the surrogate, which knows all trials"
 
 
 def value(ends: Range, place: float) -> float:

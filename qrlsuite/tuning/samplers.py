@@ -26,6 +26,9 @@ NAMES = {
 REGRET = 0.05
 """The expected regret at which a `bayesian` search ends, unless told otherwise."""
 
+LAST = 25
+"""Seeds of each setting in the last round of a `bayesian` search, for each seed of a trial, unless told otherwise."""
+
 
 @pydantic.dataclasses.dataclass(frozen=True)
 class SamplerOptions:
@@ -34,6 +37,7 @@ class SamplerOptions:
     trials: Annotated[int | None, pydantic.Field(ge=1, le=100_000)] = None
     seed: Annotated[int, pydantic.Field(ge=0)] = 0
     regret: Annotated[float | None, pydantic.Field(gt=0, allow_inf_nan=False)] = None
+    last: Annotated[int | None, pydantic.Field(ge=0, le=10_000)] = None
 
 
 def read(text: str) -> tuple[str, SamplerOptions]:

@@ -75,6 +75,8 @@ class Request:
         See `qrlsuite.tuning.samplers`, and for `bayesian` `qrlsuite.tuning.bayesian`.
     regret:
         With `bayesian`, the expected regret at which the search ends.
+    last:
+        With `bayesian`, the seeds of each of the best three settings in the last round; 0 for none.
     rows:
         With `bayesian`, settings that are tried first: `lr=.002 buffer=10000` or `preset=FILE.toml`.
     budget:
@@ -95,6 +97,7 @@ class Request:
     budget: Budget | None = None
     sampler_seed: int = 0
     regret: float = samplers.REGRET
+    last: int = 0
     rows: tuple[str, ...] = ()
     seeds: tuple[int, ...] = ()
     epochs: int | None = None
@@ -133,9 +136,13 @@ def read_requests(
         As `tuning_seeds` reads them; None takes `SEEDS`.
     """
     grid, varied, rows = space.read_varied(vary)
-    name, chosen = samplers.read(sampler or ("grid" if (grid or varied) and not rows else "bayesian"))
-    if name != "bayesian" and (rows or chosen.regret is not None):
-        what = f"--vary '{rows[0]}'" if rows else "regret"
+    listed = space.only_lists(grid, varied) and not rows
+    name, chosen = samplers.read(sampler or ("grid" if listed else "bayesian"))
+    own = tuning_seeds(SEEDS[name == "bayesian"] if seeds is None else seeds)
+    for_bayesian = [f"--vary '{row}'" for row in rows]
+    for_bayesian += [option for option in ("regret", "last") if getattr(chosen, option) is not None]
+    if name != "bayesian" and for_bayesian:
+        what = for_bayesian[0]
         raise OptionError(f"{what} is for --sampler bayesian, and not for {name}")
     shared = Request(
         task,
@@ -147,8 +154,9 @@ def read_requests(
         sampler_seed=chosen.seed,
         budget=None if budget is None else Budget.parse(budget),
         regret=samplers.REGRET if chosen.regret is None else chosen.regret,
+        last=samplers.LAST * len(own) if chosen.last is None else chosen.last,
         rows=rows,
-        seeds=tuning_seeds(SEEDS[name == "bayesian"] if seeds is None else seeds),
+        seeds=own,
         epochs=epochs,
         objective=objective,
     )

@@ -273,6 +273,18 @@ def read_varied(
     return load(grids[0]) if grids else None, given, rows
 
 
+def only_lists(grid: GridFile | None, varied: Sequence[Setting]) -> bool:
+    """Whether options are varied, and each by a list of values."""
+    in_file = [
+        values
+        for families in (grid.search if grid else {}).values()
+        for names in families.values()
+        for values in names.values()
+    ]
+    values = [*in_file, *(setting.value for setting in varied)]
+    return bool(values) and all(isinstance(each, list) for each in values)
+
+
 def _values(name: str, value: Any) -> list[Any] | Range:
     """Read the value of `--vary`: a list, or a range as an inline table."""
     if isinstance(value, list):

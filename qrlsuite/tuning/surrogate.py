@@ -78,6 +78,23 @@ class Regret:
     near: float
 
 
+def regret_of(draws: Floats) -> Regret:
+    """Return the mean and the percentiles of draws of a regret, as shares."""
+    low, high = np.quantile(draws, (0.05, 0.95))
+    return Regret(float(draws.mean()), float(low), float(high), float((draws <= NEAR).mean()))
+
+
+def regret_among(means: Floats, spreads: Floats, counts: Floats) -> Regret:
+    """Return the regret of the settings with the least mean among a few that were trained on seeds of their own.
+
+    The logarithms of the means are normal, each with its standard error; see `variances` for the parameters, (K,).
+    """
+    generator = np.random.Generator(np.random.Philox(key=0))
+    noise = generator.standard_normal((10_000, len(means))) * spreads / np.sqrt(counts)
+    logs = np.log(means) + noise
+    return regret_of(np.exp(logs[:, means.argmin()] - logs.min(axis=1)) - 1)
+
+
 def variances(means: Floats, spreads: Floats, counts: Floats) -> Floats:
     """Return the variance of a run at each place, in units of the squared mean.
 
@@ -207,9 +224,7 @@ class Climb:
         ranked = [numbers[i] for i in np.argsort(at_tried, kind="stable")]
         self.order, self.best = ranked, ranked[0]
         places, draws = self._draws(ranked, self._others(generator), surrogate, generator)
-        regrets = np.exp(draws[0] - draws.min(axis=0)) - 1
-        low, high = np.quantile(regrets, (0.05, 0.95))
-        self.regret = Regret(float(regrets.mean()), float(low), float(high), float((regrets <= NEAR).mean()))
+        self.regret = regret_of(np.exp(draws[0] - draws.min(axis=0)) - 1)
         self._wanted = []
         if self._first_left:
             return

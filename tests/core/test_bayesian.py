@@ -129,6 +129,54 @@ def test_a_range_is_extended_while_the_best_lies_at_its_end(tiny_task: str, tmp_
     assert found.preset().tuning.space["algorithm.lr"]["high"] == found.searched["algorithm.lr"].high  # type: ignore[union-attr, index]
 
 
+def test_the_last_round_takes_the_best_of_three_on_seeds_that_no_other_trial_had(
+    tiny_task: str, tmp_path: Path
+) -> None:
+    """On the seeds of the search, learning rates near .05 have luck: it is gone on others."""
+
+    def speed(entry: Entry, seed: int) -> float:
+        lucky = seed < 1_100_000 and entry.algorithm_options.lr > 5e-4
+        return near(0.05 if lucky else 5e-4, 1.0)(entry, seed)
+
+    wanted = request(tiny_task, trials=30, rows=("lr=.0123456 epsilon=.1",), last=20)
+    train = Recorder(tmp_path / "tuning", speed)
+    found = finish(Bayesian(wanted, tmp_path), train)
+    before = finish(Bayesian(request(tiny_task, trials=30, rows=wanted.rows), tmp_path), train)
+    assert {trial.number for trial in found.last} == {trial.number for trial in before.ordered[:3]}
+    assert {trial.seeds for trial in found.last} == {tuple(range(1_100_000, 1_100_020))}
+    assert before.best is not None
+    assert found.best is found.last[0]
+    assert found.best.number != before.best.number
+    assert found.best.merit.value == min(trial.merit.value for trial in found.last)
+    tuning, other = found.preset().tuning, before.preset().tuning
+    assert tuning is not None
+    assert other is not None
+    assert tuning.last is not None
+    assert tuning.last.values == tuple(trial.merit.value for trial in found.last)
+    assert tuning.last.low <= tuning.last.expected <= tuning.last.high
+    assert (tuning.last.seeds, tuning.trials, tuning.regret) == (
+        "1100000:1100020",
+        other.trials,
+        other.regret,
+    )
+    assert found.runs_done == before.runs_done + 3 * 20 <= found.runs_planned
+    assert "last" not in other.model_dump(), "hashes of older studies cover records without it"
+    text = _tuned_text(tuning.model_dump())
+    assert text.endswith(f"{tuning.last.expected:.0%} among the last 3)")
+    stopped = Bayesian(wanted, tmp_path)
+    while len(stopped.trials) < len(before.trials):
+        stopped.step(train)
+    assert str(stopped.preset().tuning.note).endswith("; the last round is missing")  # type: ignore[union-attr]
+
+
+def test_the_regret_among_a_few_settings_is_that_of_their_means() -> None:
+    """Two settings of equal means, one standard error each: the mean of the positive part of their difference."""
+    equal = surrogate.regret_among(np.array([100.0, 100.0]), np.array([0.1, 0.1]), np.array([100.0, 100.0]))
+    assert equal.expected == pytest.approx(0.01 * math.sqrt(2) / math.sqrt(2 * math.pi), rel=0.05)
+    far = surrogate.regret_among(np.array([100.0, 200.0]), np.array([0.1, 0.1]), np.array([100.0, 100.0]))
+    assert far == surrogate.Regret(0.0, 0.0, 0.0, 1.0)
+
+
 def test_an_options_own_bounds_are_kept_and_said(tiny_task: str, tmp_path: Path) -> None:
     def speed(entry: Entry, seed: int) -> float:
         return 0.3 + 0.1 * float(entry.algorithm_options.gamma)
@@ -141,10 +189,11 @@ def test_an_options_own_bounds_are_kept_and_said(tiny_task: str, tmp_path: Path)
     assert (found.best.point["algorithm.gamma"] > 0.9) or found.behind
 
 
-@pytest.mark.parametrize("stop", [0, 9, 30])
+@pytest.mark.parametrize("stop", [0, 9, 30, -5])
 def test_stopped_at_any_run_it_ends_the_same(stop: int, tiny_task: str, tmp_path: Path) -> None:
-    wanted = request(tiny_task, trials=30)
+    wanted = request(tiny_task, trials=30, last=5)
     straight = finish(Bayesian(wanted, tmp_path / "a"), Recorder(tmp_path / "a" / "tuning", near(8e-3)))
+    stop = stop if stop >= 0 else straight.runs_done + stop
     with pytest.raises(KeyboardInterrupt):
         finish(Bayesian(wanted, tmp_path / "b"), Recorder(tmp_path / "b" / "tuning", near(8e-3), stop))
     rest = Recorder(tmp_path / "b" / "tuning", near(8e-3))
@@ -355,6 +404,10 @@ def test_one_value_beside_settings_is_settings_too(tiny_task: str) -> None:
     assert (lr.name, lr.value, rows) == ("lr", [0.002], ())
     _, (lr,), rows = space.read_varied(["lr=.002,.004", "lr=.003 batch=32"])
     assert (lr.value, rows) == ([0.002, 0.004], ("lr=.003 batch=32",))
-    for vary, sampler in ((["lr=.002,.004"], "grid"), (["lr=.002,.004", "lr=.002 epsilon=.2"], "bayesian")):
+    for vary, sampler in (
+        (["lr=.002,.004"], "grid"),
+        (["lr=.002,.004", "lr=.002 epsilon=.2"], "bayesian"),
+        (["lr={low=1e-3,high=1e-2}"], "bayesian"),
+    ):
         [wanted] = search.read_requests(tiny_task, ["mlp"], vary, None, None, None, "time", None)
         assert wanted.sampler == sampler

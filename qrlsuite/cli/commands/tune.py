@@ -68,8 +68,9 @@ def tune(
             "--sampler",
             metavar="NAME",
             help="Until the expected regret is small (`bayesian`), all combinations (`grid`), or `random`, with "
-            "`trials` and `seed`: 'random trials=50', 'bayesian regret=.03 trials=50' (per varied option). Default: "
-            "bayesian, or all combinations of a --vary.",
+            "`trials` and `seed`: 'random trials=50', 'bayesian regret=.03 trials=50 last=100' (`trials` per varied "
+            "option; then the best three on `last` other seeds). Default: bayesian, or all combinations of the lists "
+            "in --vary.",
         ),
     ] = None,
     seeds: Annotated[
