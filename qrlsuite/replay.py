@@ -67,8 +67,8 @@ class Replay:
         else:
             parts = [values[name].to(torch.float32) for name in self.columns]
             both = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
-            first: int | Tensor = self._stored if self._count is None else self._count
-            self.rows[:, (first + torch.arange(new, device=self.rows.device)) % capacity] = both
+            start: int | Tensor = self._stored if self._count is None else self._count
+            self.rows[:, (start + torch.arange(new, device=self.rows.device)) % capacity] = both
         self._stored += new
         if self._count is not None:
             self._count += new
