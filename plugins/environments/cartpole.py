@@ -122,10 +122,6 @@ class CartPole(CartPoleEnv):
     | `normalization` | "none"                | "none", "bounds", "arctan"; in tasks also "running"    |
     | `bounds`        | (2.4, 2.5, 0.21, 2.5) | what becomes 1 with "bounds"                           |
     | `render_mode`   | None                  | "rgb_array" or "human", which need pygame              |
-
-    ## Version History
-
-    * v1: Gymnasium's CartPole-v1.
     """
 
     def __init__(

@@ -90,10 +90,6 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
     | Argument | Default | Meaning             |
     |----------|---------|---------------------|
     | `steps`  | 20      | steps of an episode |
-
-    ## Version History
-
-    * v1: first version.
     """
 
     points: NDArray[np.float32]

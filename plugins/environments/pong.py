@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane, require_lanes
+from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.errors import StoreError
+from qrlsuite.plugins.environments.single import Single
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -49,7 +49,7 @@ class PongOptions:
     steps: Annotated[int, Field(ge=1, le=100_000, description="time limit of an episode")] = 400
 
 
-class Pong(OneLane):
+class Pong(Single):
     """Play Pong against an opponent that follows the ball.
 
     ## Description
@@ -82,33 +82,13 @@ class Pong(OneLane):
     The episode is *terminated* when a side has `points`, and *truncated* after `steps` steps. `info["score"]` is then
     1/2 + (won - lost) / (2 `points`), in [0, 1].
 
-    ## Arguments
-
-    | Argument | Default | Meaning                                             |
-    |----------|---------|-----------------------------------------------------|
-    | `points` | 3       | points that a side needs                            |
-    | `serve`  | 4.0     | steepest serve, pixels a frame                      |
-    | `frames` | 8       | frames of a step                                    |
-    | `steps`  | 400     | time limit                                          |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `PongOptions`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
 
-    def __init__(
-        self,
-        points: int = 3,
-        serve: float = 4.0,
-        frames: int = 8,
-        steps: int = 400,
-        render_mode: str | None = None,
-    ) -> None:
-        values = {"points": points, "serve": serve, "frames": frames, "steps": steps}
-        self.render_mode = render_mode
-        super().__init__(PongLanes(option_words.build(PongOptions, values, "environment 'pong'"), 1))
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        super().__init__(PongLanes, PongOptions, options, render_mode)
 
     def render(self) -> Any:
         """Return the field with the points of both sides as bars, (height, width, 3) uint8."""
@@ -120,13 +100,6 @@ class PongLanes(EpisodeLanes):
     """Vector form of `Pong` with same-step autoreset; see there for spaces and rewards.
 
     An episode begins with a uniform number of the lane's stream for each serve of the longest game.
-
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
 
     Attributes
     ----------

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
-from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane, require_lanes
+from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.errors import StoreError
+from qrlsuite.plugins.environments.single import Single
 
 FORWARD = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 """(x, y) of a step in each direction, clockwise: to the right, down, left, up."""
@@ -45,7 +45,7 @@ class RoomOptions:
         return self
 
 
-class Room(OneLane):
+class Room(Single):
     """Find the goal in a walled room, by turning and walking, as MiniGrid's empty room.
 
     ## Description
@@ -77,33 +77,13 @@ class Room(OneLane):
     The episode is *terminated* at the goal and *truncated* after `steps` steps. `info["score"]` is then the return over
     the shortest way's return, in [0, 1].
 
-    ## Arguments
-
-    | Argument | Default | Meaning                                     |
-    |----------|---------|---------------------------------------------|
-    | `size`   | 8       | side of the room, walls included            |
-    | `view`   | "own"   | "own" or "whole"                            |
-    | `sight`  | 5       | side of its own view, odd                   |
-    | `steps`  | 100     | time limit                                  |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `RoomOptions`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    def __init__(
-        self,
-        size: int = 8,
-        view: View = "own",
-        sight: int = 5,
-        steps: int = 100,
-        render_mode: str | None = None,
-    ) -> None:
-        values = {"size": size, "view": view, "sight": sight, "steps": steps}
-        self.render_mode = render_mode
-        super().__init__(RoomLanes(option_words.build(RoomOptions, values, "environment 'room'"), 1))
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        super().__init__(RoomLanes, RoomOptions, options, render_mode)
 
     def render(self) -> Any:
         """Return the room from above, (height, width, 3) uint8, with the agent's view brighter."""
@@ -116,13 +96,6 @@ class RoomLanes(EpisodeLanes):
 
     Observations are flat, (L, channels * height * width). An episode begins with three uniform numbers of the lane's
     stream: agent, goal and direction.
-
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
     """
 
     name = "room"

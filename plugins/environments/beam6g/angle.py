@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, field_validator
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
 from qrlsuite.actions import check_actions
 from qrlsuite.environment import (
     LaneEnv,
-    OneLane,
     State,
     batched_spaces,
     endings,
@@ -27,6 +25,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.options import checked
 from qrlsuite.plugins.environments.beam6g.physics import Antenna, FloatArray, offsets, physics
+from qrlsuite.plugins.environments.single import Single
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -57,7 +56,7 @@ class AngleOptions:
         return checked(0, antenna)
 
 
-class BeamAngle(OneLane):
+class BeamAngle(Single):
     """Steer the beam of one antenna after a moving user, knowing only angles and how well they served.
 
     ## Description
@@ -110,43 +109,17 @@ class BeamAngle(OneLane):
     the sum of the best ones, over the steps 0 to `steps`, in [0, 1]. `info["metrics"]["angle-error"]` is the mean
     distance of the angle to the best one, radians.
 
-    ## Arguments
-
-    | Argument  | Default          | Meaning                                  |
-    |-----------|------------------|------------------------------------------|
-    | `antenna` | ((3, 0), (1, 0)) | position and orientation                 |
-    | `degree`  | 3                | support points of a path, 2 to 32        |
-    | `steps`   | 200              | actions per episode                      |
-    | `turn`    | 0.2              | most that a beam turns in a step, radians |
-    | `stack`   | 4                | number of last observations that make one |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `AngleOptions`.
     """
 
-    def __init__(
-        self,
-        antenna: Antenna = ((3.0, 0.0), (1.0, 0.0)),
-        degree: int = 3,
-        steps: int = 200,
-        turn: float | None = 0.2,
-        stack: int = 4,
-    ) -> None:
-        values = {"antenna": antenna, "degree": degree, "steps": steps, "turn": turn, "stack": stack}
-        super().__init__(AngleLanes(option_words.build(AngleOptions, values, "environment 'beam-angle'"), 1))
+    def __init__(self, **options: Any) -> None:
+        super().__init__(AngleLanes, AngleOptions, options)
 
 
 class AngleLanes(LaneEnv):
-    """Vector form of `BeamAngle` with same-step autoreset; see there for spaces and rewards.
+    """Vector form of `BeamAngle` with same-step autoreset; see there for spaces and rewards."""
 
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
-    """
+    name = "beam-angle"
 
     def __init__(self, options: AngleOptions, num_envs: int) -> None:
         if num_envs < 1:
@@ -223,10 +196,10 @@ class AngleLanes(LaneEnv):
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue where `state_dict` was taken; states may be sliced and joined along the lanes."""
         known = self._state()
-        require_state("beam-angle", state, {name: value.shape for name, value in known.items()})
-        trajectory.require_inside("beam-angle", state["support_points"])
+        require_state(self.name, state, {name: value.shape for name, value in known.items()})
+        trajectory.require_inside(self.name, state["support_points"])
         if state["step"].min() < 0 or state["step"].max() > self.options.steps:
-            raise StoreError(f"beam-angle: 'step' must lie in 0..{self.options.steps}")
+            raise StoreError(f"{self.name}: 'step' must lie in 0..{self.options.steps}")
         for name, value in known.items():
             value[...] = state[name]
         self._tabulate(self._lane)

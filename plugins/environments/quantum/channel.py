@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
 from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
@@ -92,25 +91,13 @@ class Channel(Drawn):
     The episode is *terminated* when a channel is named, and after `steps` steps. `info["score"]` is 1 where the name
     was right, else 0.
 
-    ## Arguments
-
-    | Argument   | Default | Meaning                                        |
-    |------------|---------|------------------------------------------------|
-    | `strength` | 0.4     | p, in (0, 1]                                   |
-    | `steps`    | 20      | experiments, and the step that names           |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `ChannelOptions`.
     """
 
     lanes: ChannelLanes
 
-    def __init__(self, strength: float = 0.4, steps: int = 20, render_mode: str | None = None) -> None:
-        values = {"strength": strength, "steps": steps}
-        super().__init__(
-            ChannelLanes(option_words.build(ChannelOptions, values, "environment 'channel'"), 1), render_mode
-        )
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        super().__init__(ChannelLanes, ChannelOptions, options, render_mode)
 
     def moment(self) -> FloatArray:
         """Return the probability of each channel after all measurements, (5,)."""
@@ -130,13 +117,6 @@ class ChannelLanes(EpisodeLanes):
     """Vector form of `Channel`; see there for spaces and rewards.
 
     An episode begins with uniform numbers of the lane's stream: one for the channel, and one for each outcome.
-
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
 
     Attributes
     ----------

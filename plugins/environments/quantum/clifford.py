@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
 from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
@@ -114,35 +113,13 @@ class Clifford(Drawn):
     The episode is *terminated* when the operation is written, and *truncated* after `steps` gates. `info["score"]` is 1
     where it was written, else 0.
 
-    ## Arguments
-
-    | Argument   | Default | Meaning                                    |
-    |------------|---------|--------------------------------------------|
-    | `qubits`   | 2       | 2 to 4                                     |
-    | `coupling` | "line"  | "line", "ring" or "all"                    |
-    | `scramble` | 20      | most random gates of a target              |
-    | `steps`    | 20      | most gates of an episode                   |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `CliffordOptions`.
     """
 
     lanes: CliffordLanes
 
-    def __init__(
-        self,
-        qubits: int = 2,
-        coupling: str = "line",
-        scramble: int = 20,
-        steps: int = 20,
-        render_mode: str | None = None,
-    ) -> None:
-        values = {"qubits": qubits, "coupling": coupling, "scramble": scramble, "steps": steps}
-        super().__init__(
-            CliffordLanes(option_words.build(CliffordOptions, values, "environment 'clifford'"), 1),
-            render_mode,
-        )
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        super().__init__(CliffordLanes, CliffordOptions, options, render_mode)
 
     def moment(self) -> IntArray:
         """Return the remaining operation, (2n, 2n) bits."""
@@ -158,13 +135,6 @@ class Clifford(Drawn):
 
 class CliffordLanes(EpisodeLanes):
     """Vector form of `Clifford`; see there for spaces and rewards.
-
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
 
     Attributes
     ----------

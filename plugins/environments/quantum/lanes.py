@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.environment import EpisodeLanes, OneLane
 from qrlsuite.plugins.environments.quantum.pictures import pixels
+from qrlsuite.plugins.environments.single import Single
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,18 +37,15 @@ def words(qubits: int) -> list[str]:
     return ["".join(each) for each in product("IXYZ", repeat=qubits)][1:]
 
 
-class Drawn(OneLane):
+class Drawn(Single):
     """One lane that remembers the actions of this episode, and draws them with matplotlib."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}
 
-    def __init__(self, lanes: EpisodeLanes, render_mode: str | None) -> None:
-        super().__init__(lanes)
-        self.render_mode = render_mode
-        self.done: list[Any] = []
-        """The episode's actions."""
-        self.shown: list[Any] = []
-        """Results of `moment` after the reset and after every step."""
+    done: list[Any]
+    """The episode's actions."""
+    shown: list[Any]
+    """Results of `moment` after the reset and after every step."""
 
     def moment(self) -> Any:
         """Return data of this moment for the picture."""

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
 from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
@@ -128,54 +127,13 @@ class Pulse(Drawn):
 
     After `steps` steps the episode is *terminated*, and `info["score"]` is F, in [0, 1].
 
-    ## Arguments
-
-    | Argument         | Default     | Meaning                                            |
-    |------------------|-------------|----------------------------------------------------|
-    | `qubits`         | 1           | 1 or 2                                             |
-    | `control`        | "bang-bang" | "bang-bang" or "continuous"                        |
-    | `steps`          | 20          | pieces of constant fields                          |
-    | `duration`       | 2 pi        | time of an episode, hbar / h                       |
-    | `strength`       | 4           | full field J, h                                    |
-    | `coupling`       | 1           | c, of two qubits, h                                |
-    | `start`          | "random"    | "zero" or "random"                                 |
-    | `dephasing`      | 0           | rate of the decay of coherence, h / hbar           |
-    | `miscalibration` | 0           | standard deviation of the field's relative error   |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `PulseOptions`.
     """
 
     lanes: PulseLanes
 
-    def __init__(
-        self,
-        qubits: int = 1,
-        control: str = "bang-bang",
-        steps: int = 20,
-        duration: float = 6.283185307179586,
-        strength: float = 4.0,
-        coupling: float = 1.0,
-        start: str = "random",
-        dephasing: float = 0.0,
-        miscalibration: float = 0.0,
-        render_mode: str | None = None,
-    ) -> None:
-        values = {
-            "qubits": qubits,
-            "control": control,
-            "steps": steps,
-            "duration": duration,
-            "strength": strength,
-            "coupling": coupling,
-            "start": start,
-            "dephasing": dephasing,
-            "miscalibration": miscalibration,
-        }
-        super().__init__(
-            PulseLanes(option_words.build(PulseOptions, values, "environment 'pulse'"), 1), render_mode
-        )
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        super().__init__(PulseLanes, PulseOptions, options, render_mode)
 
     def moment(self) -> ComplexArray:
         """Return the density matrix (d, d)."""
@@ -201,15 +159,7 @@ class Pulse(Drawn):
 
 
 class PulseLanes(EpisodeLanes):
-    """Vector form of `Pulse`; see there for spaces and rewards.
-
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
-    """
+    """Vector form of `Pulse`; see there for spaces and rewards."""
 
     name = "pulse"
 

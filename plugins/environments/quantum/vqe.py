@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options as option_words
 from qrlsuite.environment import EpisodeLanes, LaneEnv, require_lanes
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.compiled import optimize
@@ -139,28 +138,13 @@ class VQE(Drawn):
     After `steps` gates the episode is *terminated*. `info["score"]` is the score, in [0, 1], and
     `info["metrics"]["energy-error"]` is E - E_0.
 
-    ## Arguments
-
-    | Argument | Default | Meaning                         |
-    |----------|---------|---------------------------------|
-    | `model`  | "h2"    | "h2" or "ising"                 |
-    | `qubits` | 2       | 2, of an Ising chain up to 5    |
-    | `steps`  | 6       | gates of an episode             |
-
-    ## Version History
-
-    * v1: first version.
+    Arguments are the fields of `VQEOptions`.
     """
 
     lanes: VQELanes
 
-    def __init__(
-        self, model: str = "h2", qubits: int = 2, steps: int = 6, render_mode: str | None = None
-    ) -> None:
-        values = {"model": model, "qubits": qubits, "steps": steps}
-        super().__init__(
-            VQELanes(option_words.build(VQEOptions, values, "environment 'vqe'"), 1), render_mode
-        )
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        super().__init__(VQELanes, VQEOptions, options, render_mode)
 
     def moment(self) -> float:
         """Return the energy above the ground state's."""
@@ -178,13 +162,6 @@ class VQE(Drawn):
 
 class VQELanes(EpisodeLanes):
     """Vector form of `VQE`; see there for spaces and rewards.
-
-    Parameters
-    ----------
-    options:
-        Common to all lanes.
-    num_envs:
-        Number of lanes L, at least 1.
 
     Attributes
     ----------
