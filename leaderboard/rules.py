@@ -90,14 +90,8 @@ class _Fenced:
 
     Parameters
     ----------
-    rule:
-        The rule itself.
     name:
         Under which it was registered.
-    promise:
-        Its promise.
-    origin:
-        Its name in messages.
     """
 
     def __init__(self, rule: SignificanceRule, name: str, promise: str, origin: str) -> None:

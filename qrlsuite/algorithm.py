@@ -26,8 +26,6 @@ class BuildModel(Protocol):
 
         Parameters
         ----------
-        outputs:
-            Numbers that a network returns.
         inputs:
             Number of its inputs; None: the size of an observation. If it gets more, such as the critic of a continuous
             action, the observation comes first.

@@ -53,8 +53,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
     Parameters
     ----------
-    name:
-        The typed name.
     known:
         Every name that would have been accepted.
     """

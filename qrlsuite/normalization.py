@@ -36,8 +36,6 @@ class Normalization:
 
     Parameters
     ----------
-    kind:
-        One of the four.
     space:
         The observations' box, of shape (n,).
     low, high:
@@ -49,11 +47,6 @@ class Normalization:
     ----------
     space:
         The box of normalized observations.
-
-    Raises
-    ------
-    qrlsuite.errors.OptionError
-        If the bounds are missing, infinite, of the wrong number or empty, or given to another kind.
     """
 
     def __init__(

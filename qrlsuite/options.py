@@ -154,8 +154,6 @@ def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
 
     Parameters
     ----------
-    cls:
-        The options dataclass.
     values:
         Given values by name; absent ones take their defaults.
     where:

@@ -58,8 +58,6 @@ class Plugin:
     ----------
     name:
         Its name among the distribution's entry points.
-    module:
-        Its target.
     version:
         The distribution's version; `""` where there is none.
     requires:
@@ -112,15 +110,7 @@ class Registry:
                 yield entries[name]
 
     def get(self, kind: type[S], name: str) -> Registered[S]:
-        """Look up a spec.
-
-        Raises
-        ------
-        UnknownNameError
-            If nothing of that kind has the name; the message gives the nearest match.
-        PluginError
-            If two distributions registered it.
-        """
+        """Look up a spec."""
         owners = self.duplicates.get((kind, name))
         if owners:
             raise PluginError(_duplicate(owners))
@@ -139,23 +129,11 @@ class Registry:
         -------
         dict
             Names that it registered, by kind in the plural.
-
-        Raises
-        ------
-        PluginError
-            As `collect`.
         """
         return self.add(self.collect(plugin, distribution))
 
     def collect(self, plugin: Any, distribution: str) -> list[Registered[Any]]:
-        """Register a plugin object with the manager; return the specs from its hooks, not yet added.
-
-        Raises
-        ------
-        PluginError
-            If it implements a hook that does not exist, one of its hooks has a wrong signature, raises, or hands
-            over something that is not a spec.
-        """
+        """Register a plugin object with the manager; return the specs from its hooks, not yet added."""
         name = f"{distribution}:{getattr(plugin, '__name__', plugin)}"
         handed: list[Registered[Any]] = []
         try:
@@ -231,13 +209,7 @@ class Registry:
             self.report(_duplicate(owners))
 
     def report(self, problem: str) -> None:
-        """Note a problem and warn of it.
-
-        Raises
-        ------
-        PluginError
-            If problems are fatal.
-        """
+        """Note a problem and warn of it."""
         if self.strict:
             raise PluginError(problem)
         self.problems.append(problem)
@@ -272,13 +244,7 @@ def words(error: BaseException) -> str:
 
 
 def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
-    """Entry points of the group with their distribution's name, the suite's own first.
-
-    Raises
-    ------
-    PluginError
-        If `QRLSUITE_LOAD_PLUGINS` names a distribution that has none.
-    """
+    """Entry points of the group with their distribution's name, the suite's own first."""
     points: dict[tuple[str, str], metadata.EntryPoint] = {}
     for point in metadata.entry_points(group=hookspecs.PROJECT):
         owner = point.dist.name if point.dist is not None else "unknown"
@@ -316,11 +282,6 @@ def create(
         Raise at the first broken plugin instead of skipping it with a `PluginWarning`.
     points:
         Where entry points come from; tests hand in their own.
-
-    Raises
-    ------
-    PluginError
-        If strict, and a plugin is broken.
     """
     manager = pluggy.PluginManager(hookspecs.PROJECT)
     hooks: Any = SimpleNamespace(**hookspecs.HOOKS)
@@ -388,11 +349,6 @@ def required_versions(distribution: metadata.Distribution | None) -> str:
 
     pip honors the requirement when the plugin is installed, and lets a later upgrade of the suite break it; so it
     is read again before the plugin is imported.
-
-    Raises
-    ------
-    PluginError
-        If its requirements cannot be read.
     """
     if distribution is None or distribution.name == "qrlsuite":
         return ""
@@ -415,13 +371,7 @@ def required_versions(distribution: metadata.Distribution | None) -> str:
 
 
 def check_version(distribution: metadata.Distribution | None, version: str | None = None) -> None:
-    """Refuse a distribution that does not work with this version of the suite.
-
-    Raises
-    ------
-    PluginError
-        Names the distribution, the required and the present version, and the command to type.
-    """
+    """Refuse a distribution that does not work with this version of the suite."""
     needs = required_versions(distribution)
     if not needs or distribution is None:
         return

@@ -109,8 +109,6 @@ def build(
 
     Parameters
     ----------
-    entries:
-        Of any tasks.
     refused:
         Lines about unreadable entries; they are passed on.
     rule:

@@ -128,8 +128,6 @@ def estimate(
     ----------
     read:
         Value, low and high of a row; None where it has none.
-    write:
-        Writes each of them.
     flat:
         Heads of low and high in spreadsheets.
     more:

@@ -116,8 +116,6 @@ def compare_entries(
 
     Parameters
     ----------
-    first, second:
-        The entries.
     rule:
         Judges each cell of the task's grid, too; None means the rule that the task names, if it names one.
     by:

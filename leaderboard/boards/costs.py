@@ -41,12 +41,8 @@ class Unit:
 
     Attributes
     ----------
-    text:
-        Writes a number of this unit.
     step_text:
         Writes the price of one step.
-    meaning:
-        The unit in a sentence.
     """
 
     name: str
@@ -177,8 +173,6 @@ class CostSection:
         All pairs of ranked entries, along the cost in parts of the budget; None if there are none.
     budget:
         The total cost of the cheapest ranked entry.
-    part:
-        Cost of one part.
     exact:
         Whether curves are read at the ends of epochs, which cost the same for all.
     """

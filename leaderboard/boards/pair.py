@@ -50,12 +50,8 @@ class OnBoard:
 
     Attributes
     ----------
-    n_entries:
-        Ranked entries of the board.
     adjusted:
         p of the pair, adjusted for all of its pairs.
-    direction:
-        The verdict there.
     """
 
     n_entries: int
@@ -81,8 +77,6 @@ class PairVerdict:
     ----------
     labels:
         Labels of the two entries, without the algorithm if they share it.
-    times:
-        The verdict and every threshold.
     thresholds:
         Thresholds of the grid, in units of the score.
     scores:
@@ -379,8 +373,6 @@ def pair_on(
     ----------
     finals:
         The board's ranked entries by final score; None if it ranks none.
-    grid:
-        The grid of the board.
     labels:
         Names of the two in the verdict.
     """

@@ -55,8 +55,6 @@ class ScoreSection:
         error for all pairs together.
     entries:
         The ranked entries, in the order of `results`.
-    results:
-        All statistics.
     n_last:
         Number of epochs in a final score, a mean.
     unranked:

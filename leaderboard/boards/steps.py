@@ -39,14 +39,10 @@ class Support:
 
     Attributes
     ----------
-    winner, loser:
-        Labels of the pair.
     cells:
         Cells in which the winner needs significantly fewer samples.
     at_cap:
         Cells that say nothing, because both are at the cap.
-    total:
-        Cells of the grid.
     """
 
     winner: str
@@ -140,12 +136,8 @@ class Section:
         Whether it is shorter than the task's own horizons.
     ranking, score:
         The task's thresholds, cells, costs and policies; and its score.
-    entries:
-        All compared entries.
     rows:
         The shown entries, in the order of their steps below threshold.
-    times:
-        Their ranks.
     judge:
         The significance rule that the tiers rest on.
     by_tiers:

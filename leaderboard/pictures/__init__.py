@@ -74,10 +74,6 @@ def draw(kind: str, entries: Sequence[EntryResults] = (), **settings: Any) -> Fi
     ----------
     kind:
         A key of `KINDS`.
-    entries:
-        The entries to show.
-    settings:
-        Its options by name.
     """
     if kind not in KINDS:
         raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, KINDS)}")

@@ -56,8 +56,6 @@ def compose(
     ----------
     kind:
         A name of `summaries`.
-    written:
-        The tasks as they are written.
     entries, horizon:
         As for `qrlsuite.leaderboard.shelf.collect.select`.
     seeds:

@@ -43,8 +43,6 @@ def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figur
     ----------
     lines:
         One or more entries, which played the same episodes.
-    values:
-        The K values as texts.
     """
     chosen: DeployedOptions = options.build(DeployedOptions, settings, "picture 'deployed'")
     if not any(line.deployed for line in lines):

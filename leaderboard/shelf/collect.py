@@ -37,8 +37,6 @@ class Selection:
 
     Attributes
     ----------
-    runs:
-        The results folder.
     published:
         Whether to read the published entries that come with the suite, too. `runs` need not exist then.
     tasks:

@@ -44,8 +44,6 @@ class EntryResults(Shown):
 
     Attributes
     ----------
-    record:
-        What was run.
     task_file:
         The task as it is judged: as it is registered now, where its definition is the same.
     records:

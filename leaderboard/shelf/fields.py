@@ -38,8 +38,6 @@ class Field:
 
     Attributes
     ----------
-    type:
-        Type in Arrow.
     meaning:
         Explanation for readers of tables.
     unit:
@@ -113,11 +111,6 @@ FIELDS: dict[Rows, tuple[Field, ...]] = {
 
 def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     """Return entries as a table.
-
-    Parameters
-    ----------
-    rows:
-        The kind of rows.
 
     Returns
     -------

@@ -55,8 +55,6 @@ class Imported:
     ----------
     store:
         The entry's folder here.
-    name, label, task:
-        Names of the entry and its task.
     new, known:
         Copied seeds, and seeds that existed already.
     notes:

@@ -193,8 +193,6 @@ class PublishedAgents(EntryStore):
 
     Parameters
     ----------
-    folder:
-        Folder of the published entry.
     runs:
         A results folder for evaluations: nothing is written beside published files.
     """

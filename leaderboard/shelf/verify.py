@@ -102,8 +102,6 @@ class Retrained:
         (k, T).
     executions:
         (k,): circuit executions of each.
-    agents:
-        The trained parameters of each.
     parameters:
         Parameters that the entry's record may state: of all networks; and of the first network alone, if the record
         states no number of networks.

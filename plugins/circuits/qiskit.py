@@ -57,13 +57,7 @@ def quantum_circuit(elementary: Elementary, qubits: int) -> QuantumCircuit:
 
 
 class QiskitBackend:
-    """A circuit on a simulator of Qiskit's, see `qrlsuite.circuit.CircuitBackend`.
-
-    Attributes
-    ----------
-    gradient:
-        How it is differentiated.
-    """
+    """A circuit on a simulator of Qiskit's, see `qrlsuite.circuit.CircuitBackend`."""
 
     def __init__(self, circuit: Circuit, options: QiskitOptions) -> None:
         self.options = options

@@ -102,8 +102,6 @@ def work(mark: str, arguments: Sequence[str], environment: Mapping[str, str]) ->
         A file of the client's, which a machine sees that shares the folder.
     arguments:
         The worker's command line after Python's own path, which is this machine's.
-    environment:
-        Variables that are set for it.
     """
     if not Path(mark).exists():
         return json.dumps([UNSEEN, socket.gethostname()]).encode()

@@ -32,8 +32,6 @@ def draw_text(circuit: Circuit, angles: bool = False) -> str:
 
     Parameters
     ----------
-    circuit:
-        The circuit to draw.
     angles:
         Write every angle into its gate; otherwise gates carry their name alone.
     """

@@ -31,8 +31,6 @@ class Elementary:
     ----------
     gates:
         The gates in order: RX, RY, RZ, H, X, Y, Z, S, T, CNOT, CZ, SWAP.
-    rotations:
-        Number R of rotations.
     """
 
     def __init__(self, circuit: Circuit, table: AngleTable) -> None:

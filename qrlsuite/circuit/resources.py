@@ -19,8 +19,6 @@ class Resources:
         Numbers of qubits, input features and trainable scalars.
     gates:
         Number of gates by name; a controlled one has a `C` in front (`CRot`).
-    two_qubit_gates:
-        Number of gates on two qubits.
     two_qubit_depth:
         Two-qubit gates on the longest path through the circuit: gates on disjoint qubits count as one step.
     depth:

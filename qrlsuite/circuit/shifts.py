@@ -139,10 +139,6 @@ def measured(angles: Tensor, execute: Execute, rule: Rule, most: int = 2**62) ->
     ----------
     angles:
         (A, B) radians.
-    execute:
-        Runs circuits.
-    rule:
-        How to differentiate.
     most:
         Lanes that one call of the backward pass may have.
 

@@ -61,14 +61,10 @@ def trace(
 
     Parameters
     ----------
-    function:
-        The QNode, or the function.
     qubits, layers:
         Size of the circuit, which the shapes in `weight_shapes` may depend on; None for as many as the function has.
     call:
         What is called in its place, with options of its own.
-    mean_field:
-        Return the mean-field approximation.
 
     Raises
     ------

@@ -78,8 +78,6 @@ class WorkerJob:
         ----------
         reason:
             How the process ended: `signal SIGKILL`.
-        text:
-            Output of the process.
         """
         size = self.progress.size(len(self.group.seeds))
         done = len(self.work.store.finished(self.group.seeds, self.work.epochs))

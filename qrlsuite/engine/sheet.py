@@ -44,16 +44,12 @@ class Sheet:
     columns:
         In the order of their importance: where a line has no room for all, the last are left out. Columns for files
         alone are left out, too.
-    rows:
-        The rows from which the columns read.
     notes:
         In the order of their importance: the first three are written, unless `explained`.
     explained:
         Whether all notes, and the meanings of the columns that are written, stand below the table.
     lines:
         Lines that always stand below the table.
-    label:
-        By which LaTeX refers to it.
     name:
         Its title on a page with several tables.
     """

@@ -114,13 +114,7 @@ class Where:
 
 
 def build(name: str, option_values: Mapping[str, Any]) -> Engine:
-    """Build a registered engine.
-
-    Parameters
-    ----------
-    option_values:
-        Its options by name.
-    """
+    """Build a registered engine."""
     spec = registry.get(specs.EngineSpec, name)
     if spec.options is None and option_values:
         raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(option_values))}")

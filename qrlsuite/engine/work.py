@@ -26,20 +26,12 @@ class Missing:
 
     Attributes
     ----------
-    runs:
-        The results folder.
     store:
         The entry's folder in it, which need not exist yet.
-    seeds:
-        All seeds that were asked for.
-    epochs:
-        The epoch to which each is to be trained.
     busy:
         Seeds that another process trains, or that wait in a queue.
     groups:
         The other missing seeds, in groups.
-    code:
-        The code that trains them.
     """
 
     runs: Path

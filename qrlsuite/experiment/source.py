@@ -151,8 +151,6 @@ def reached(
 
     Parameters
     ----------
-    roots:
-        Names of modules.
     belongs:
         Whether a module counts, by the name and the spec of its top-level package; None if each that is found does.
     """

@@ -382,10 +382,6 @@ class Task:
 
     Attributes
     ----------
-    file:
-        The task file's content.
-    environment_options:
-        The environment's options object.
     definition:
         Everything that a run's numbers depend on, as plain values (except `options.Since`).
     hash:

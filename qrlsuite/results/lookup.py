@@ -111,11 +111,6 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
 
     If several tasks have such an entry, `TASK/NAME` selects one. A whole name goes before a beginning, and of several
     that begin with it the entry that `run` would train.
-
-    Parameters
-    ----------
-    searched:
-        The searched folder, for the message.
     """
     found = fitting(among, name)
     if not found:

@@ -74,8 +74,6 @@ class Points:
         (K,) int64: environment steps since training began, increasing, 1 or more.
     scores:
         (K,) float64, finite.
-    source:
-        Source of the points, for messages.
     metric:
         Name of the score, such as `eval/mean_reward`; empty if unknown.
     """
@@ -267,8 +265,6 @@ def read_table(table: Any, metric: str | None = None) -> dict[Run, Points]:
     ----------
     table:
         Anything that `pyarrow.table` takes: a table, a data frame of pandas or polars.
-    metric:
-        The column of the score.
     """
     try:
         arrow = table if isinstance(table, pyarrow.Table) else pyarrow.table(table)

@@ -246,8 +246,6 @@ class SeedRun:
         none.
     training:
         Metrics of training by name, such as the algorithm's losses, (T,).
-    folder:
-        The entry's folder.
     published:
         Whether it was read from a published entry.
     """

@@ -38,8 +38,6 @@ class AcrossTasks:
 
     Attributes
     ----------
-    names:
-        The entries.
     mean, interquartile_mean:
         Shape (M,): the mean over tasks of the mean over runs; the mean of the middle half of all runs of all tasks.
     mean_interval, interquartile_interval:
@@ -84,8 +82,6 @@ def across_tasks(scores: Scores, alpha: float = 0.05, n_resamples: int = 2000, s
         In (0, 1).
     n_resamples:
         Number of bootstrap resamples.
-    seed:
-        Seed of bootstrap and relabelings.
 
     Raises
     ------
@@ -278,8 +274,6 @@ def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) 
     ----------
     pairs:
         Times of the first and the second entry on each of two or more tasks, (N, E): results of `times_below`.
-    level:
-        Level of the interval.
 
     Raises
     ------

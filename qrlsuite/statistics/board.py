@@ -24,10 +24,6 @@ class Board:
 
     Attributes
     ----------
-    names:
-        The M entries.
-    rule:
-        Name of the rule that judged.
     signs:
         Shape (M, M, E, D): +1 where the row's entry needs significantly fewer samples than the column's, -1 where
         more, else 0.
@@ -84,11 +80,6 @@ def outperformance(
         The entries; their names must differ for a ranking.
     grid, rule, resampling, horizon:
         As in `qrlsuite.statistics.compare.compare`.
-
-    Raises
-    ------
-    OptionError
-        As `compare`, naming the pair.
     """
     chosen = rule or IntervalRule()
     size = len(entries)

@@ -62,8 +62,6 @@ class Comparison:
     ----------
     names:
         The first and the second entry.
-    rule:
-        Name of the rule that judged.
     grid:
         The E x D cells.
     horizon:
@@ -154,8 +152,6 @@ def in_words(outcome: Outcome, wins: int, losses: int, capped: int, cells: int) 
         Cells with significantly fewer, and more, samples.
     capped:
         Cells without a significant difference in which both are at the cap.
-    cells:
-        All cells.
     """
     fewer, more = "significantly fewer", "significantly more"
     match outcome:
@@ -196,8 +192,6 @@ def compare(
 
     Parameters
     ----------
-    first, second:
-        The entries.
     grid:
         The cells, for instance `Grid.relative(epsilons, deltas)`.
     rule:
@@ -242,11 +236,6 @@ def judge_cells(
     tuple
         Signs (M, E, D), +1 where `first` needs significantly fewer samples; and (M, E, D) where neither does and both
         intervals end at the horizon: too few steps to tell.
-
-    Raises
-    ------
-    OptionError
-        If the rule answers something else than signs.
     """
     shape, against = first.grid.shape, getattr(rule, "against", None)
     if against is not None:

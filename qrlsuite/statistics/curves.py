@@ -114,13 +114,7 @@ class LearningCurves:
         return int(self.values.shape[1]) * self.steps_per_epoch
 
     def cut(self, horizon: int) -> LearningCurves:
-        """Return the same runs up to a horizon in environment steps.
-
-        Raises
-        ------
-        OptionError
-            If the horizon is not a whole number of this entry's epochs, or beyond its last one.
-        """
+        """Return the same runs up to a horizon in environment steps."""
         horizon = whole(horizon, "horizon", at_least=1)
         if horizon % self.steps_per_epoch:
             raise OptionError(
@@ -139,13 +133,7 @@ class LearningCurves:
 
 
 def common_horizon(first: LearningCurves, second: LearningCurves, horizon: int | None = None) -> int:
-    """Return the steps to which two entries are cut: the shortest of both and of an optional limit.
-
-    Raises
-    ------
-    OptionError
-        If it is not a whole number of epochs for both.
-    """
+    """Return the steps to which two entries are cut: the shortest of both and of an optional limit."""
     shortest = min(first.horizon, second.horizon)
     if horizon is not None:
         shortest = min(shortest, whole(horizon, "horizon", at_least=1))

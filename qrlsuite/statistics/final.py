@@ -106,10 +106,6 @@ def compare_scores(
         For each entry an array (runs,) of two runs or more; numbers of runs may differ.
     alpha:
         In (0, 1): probability of any false difference among entries of equal laws.
-    n_resamples:
-        Of the bootstrap.
-    seed:
-        Of bootstrap and relabelings.
 
     Raises
     ------

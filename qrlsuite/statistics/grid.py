@@ -31,13 +31,7 @@ Goal = Literal["above", "below"]
 
 
 def whole(value: object, name: str, *, at_least: int) -> int:
-    """Return an integer option as an `int`.
-
-    Raises
-    ------
-    OptionError
-        If it is not an integer, or smaller than `at_least`.
-    """
+    """Return an integer option as an `int`."""
     if isinstance(value, (bool, np.bool_)):
         raise OptionError(f"{name} = {value!r} is not an integer")
     try:
@@ -54,11 +48,6 @@ def exact(value: object, name: str) -> Decimal:
 
     A float32 is read by its own shortest form, so `numpy.float32(0.3)` means 0.3; the noise of
     `numpy.arange(0.3, 1, 0.1)` disappears in the rounding.
-
-    Raises
-    ------
-    OptionError
-        If it is not a finite number.
     """
     try:
         number = _DIGITS.create_decimal(str(value))
@@ -156,8 +145,6 @@ class Grid:
 
         Parameters
         ----------
-        thresholds:
-            In the unit of the curves.
         deltas:
             In (0, 1].
         goal:

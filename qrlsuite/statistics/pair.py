@@ -95,8 +95,6 @@ def times_pair(
         In (0, 1).
     horizon:
         Environment steps beyond which neither entry is looked at; None means the shorter horizon.
-    seed:
-        Of the relabelings.
     seconds:
         After which relabeling stops, even if the verdict may still turn.
 

@@ -51,13 +51,7 @@ ENUMERATED = 100_000
 
 
 def relabelings_for(level: float) -> int:
-    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands.
-
-    Raises
-    ------
-    OptionError
-        If the level is outside (0, 1), or needs more than `MOST`.
-    """
+    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands."""
     needed = 20 / check_probability(level, "level")
     if needed > MOST:
         raise OptionError(
@@ -127,8 +121,6 @@ class MaxT:
     blocks:
         Runs of both entries per block, in the order of the rows, the same for all pairs: labels are exchanged
         within a block only. None means a single block. Relabelings of a block do not depend on later blocks.
-    seed:
-        Of the relabelings.
     ratio:
         Whether t is that of the log ratio of two means of positive numbers, see `ratio_t`, and not of their difference.
 

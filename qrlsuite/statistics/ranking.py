@@ -28,14 +28,10 @@ class Ranked:
 
     Attributes
     ----------
-    name:
-        The entry.
     tier:
         1 is the best; None where no pair with this entry is decided, or it never reached a goal.
     copeland:
         Entries it outperforms minus entries that outperform it, on the whole board; orders a tier.
-    outperforms, outperformed_by:
-        Their names.
     cycle:
         The entries, itself included, that outperform each other in a circle with it; empty if there are none.
     rests_on:
@@ -88,8 +84,6 @@ def rank(
 
     Parameters
     ----------
-    names:
-        M different names.
     outperforms:
         Shape (M, M), boolean: whether the row's entry outperforms the column's.
     decided:

@@ -35,8 +35,6 @@ class SmoothedRuns:
 
     Parameters
     ----------
-    entry:
-        The entry; two runs or more.
     jitter:
         h, relative to the spread of the runs.
     bounds:
@@ -87,11 +85,6 @@ def slower(entry: LearningCurves, factor: float) -> LearningCurves:
 
     A run's value after epoch t is the original's after epoch t / factor, between epochs interpolated linearly,
     before the first the first.
-
-    Raises
-    ------
-    OptionError
-        If the factor is below 1.
     """
     if not 1 <= factor < np.inf:
         raise OptionError(f"factor = {factor!r} is not a finite number >= 1")
@@ -147,8 +140,6 @@ class DecisionRates:
 
     Attributes
     ----------
-    n_studies:
-        Simulated studies.
     verdicts:
         For each pair of the design: fraction of studies with each verdict.
     within_margin:
@@ -177,11 +168,6 @@ def decision_rates(
     """Play a sequential design many times, its entries drawn from as many models, in the design's order.
 
     All studies are played together; `tick` is called for each of them at the end.
-
-    Raises
-    ------
-    OptionError
-        If there are not as many models as entries, or an argument is out of its range.
     """
     if len(models) != len(design.entries):
         raise OptionError(f"{len(models)} models for the {len(design.entries)} entries of the design")

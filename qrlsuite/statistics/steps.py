@@ -40,8 +40,6 @@ def settle(test: MaxT, alpha: float, seconds: float = math.inf) -> BoolArray:
 
     Parameters
     ----------
-    test:
-        A test of ratios.
     alpha:
         In (0, 1).
     seconds:
@@ -100,12 +98,8 @@ def ratio_interval(
     ----------
     first, second:
         Positive whole numbers, one per run: (N_A,) and (N_B,).
-    level:
-        Of the test.
     differs:
         Whether the test at this level rejected a ratio of 1: exactly then the interval leaves it out.
-    seed:
-        Of the relabelings.
     """
     swapped = in_order(first, second)
     test = _Rescaled(*((second, first) if swapped else (first, second)), level, seed)

@@ -134,8 +134,6 @@ def times_board(
         In (0, 1).
     horizon:
         Environment steps beyond which no entry is looked at; None means the horizon that all have.
-    seed:
-        Seed of the relabelings.
 
     Raises
     ------

@@ -19,8 +19,6 @@ class Finding:
 
     Attributes
     ----------
-    rule:
-        The rule's name.
     ok:
         Whether it holds.
     message:
@@ -72,8 +70,6 @@ class Checklist:
 
         Parameters
         ----------
-        rule:
-            Its name.
         looked_at:
             What a passing check has established.
         check:

@@ -49,8 +49,6 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
 
     Parameters
     ----------
-    backend:
-        A registered circuit backend.
     values:
         Options of that backend; others have their defaults, whatever the entry was trained with.
     """

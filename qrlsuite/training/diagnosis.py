@@ -58,8 +58,6 @@ class Diagnosis:
     ----------
     name:
         The entry's label.
-    seeds:
-        Seeds of the agents.
     outputs:
         `policy` if the Fisher information is of the policy, else `values`: Gaussians of unit variance.
     shapes:
@@ -148,8 +146,6 @@ def along_episodes(
     ----------
     best, seed, device, on:
         As for `qrlsuite.training.evaluation.trained`; the episodes are its first ones.
-    episodes:
-        Episodes of each agent.
     report:
         Called with the name of the computation and its progress.
     """

@@ -248,8 +248,6 @@ def trained(
     best:
         Number of runs, chosen by the best last *validation* score. The evaluation has other episodes, so the choice
         does not raise its mean.
-    episodes:
-        Complete episodes of each agent.
     seed:
         Evaluation seed; another one gives other episodes.
     on:

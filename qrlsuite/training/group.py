@@ -83,14 +83,8 @@ class GroupFiles:
 
     Parameters
     ----------
-    entry, entry_store:
-        The entry to train, and its folder.
     seeds:
         Protocol seeds; all at the same epoch.
-    events:
-        The trackers to notify.
-    code:
-        The identity of the code that trains.
     """
 
     def __init__(
@@ -247,8 +241,6 @@ class GroupRun:
     parts:
         The entries, their folders and seeds, all at the same epoch. Several entries are trained in one population, with
         the results of separate training.
-    epochs:
-        The epoch at which to stop.
     device:
         Where the populations live: `cpu`, `cuda` or `cuda:1`.
     report:

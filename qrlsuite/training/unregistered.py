@@ -98,8 +98,6 @@ def require_none(
     ----------
     build:
         Builds the module of the first seed (0) or of another seed (1), anew at every call.
-    inputs:
-        Number of inputs.
     stacked:
         Whether `qrlsuite.population.stack` makes the population: `torch.vmap` hands buffers to a pass and drops their
         changes, so that a pass may change none.

@@ -150,8 +150,6 @@ def measure(
         The probability that a bit is then read wrongly.
     shots, rows:
         (R,): how often each run is measured, and which row of `counts` that counts for.
-    source:
-        A NumPy generator.
     counts:
         (L, 2^n), to which is added.
     """

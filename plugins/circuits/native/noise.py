@@ -50,8 +50,6 @@ class PauliNoise:
     ----------
     elementary:
         The circuit's elementary gates.
-    qubits:
-        Its number n of qubits.
     rate:
         Rate of two-qubit gates; the rate of one-qubit gates is a tenth of it.
 

@@ -91,8 +91,6 @@ class Job:
 
     Attributes
     ----------
-    program:
-        The compiled gates.
     samples:
         Angles and matrices of B samples, 1 where the circuit is not broadcast.
     phases:

@@ -381,8 +381,6 @@ def compile_operations(
 
     Parameters
     ----------
-    qubits, inputs:
-        How many there are.
     operations:
         The gates. Their angles have inputs and constants, and no parameters.
     fresh:

@@ -176,10 +176,6 @@ class _Deferred:
 
     Attributes
     ----------
-    wires:
-        Of every qubit its wire.
-    count:
-        Number of wires.
     bits:
         Of every bit that is measured the wire that has it.
     """

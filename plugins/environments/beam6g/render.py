@@ -40,12 +40,6 @@ class Moment:
     ----------
     path:
         The user's positions at steps 0..K, (K + 1, 2).
-    step:
-        The step that the user is at.
-    antenna, beam, intensity:
-        The serving antenna, its beam, and the intensity.
-    best:
-        The antenna that would be best.
     received:
         Sum of the intensities received so far.
     """
@@ -127,13 +121,7 @@ def ground_truth_figure(options: BeamOptions, resolution: int = 500) -> Figure:
 
 
 class FrameRenderer:
-    """Draws moments of episodes in one field; the background is drawn once.
-
-    Parameters
-    ----------
-    options:
-        Options of the environment.
-    """
+    """Draws moments of episodes in one field; the background is drawn once."""
 
     def __init__(self, options: BeamOptions) -> None:
         self.options = options
