@@ -172,19 +172,6 @@ def best(population: nn.Module, x: Tensor) -> Tensor:
     return torch.from_numpy(whole.best(x.contiguous().numpy()))
 
 
-def chosen_values(population: nn.Module, x: Tensor, chosen: Tensor) -> Tensor:
-    """Return the outputs `chosen` (S, B), one of each sample, (S, B), for x (S, B, in); without gradients."""
-    whole = _sweep_of(population)
-    if whole is None or not compilable(x) or x.requires_grad:
-        with torch.no_grad():
-            return _chosen(population(x), chosen)
-    return torch.from_numpy(whole.chosen(x.contiguous().numpy(), chosen.contiguous().numpy()))
-
-
-def _chosen(values: Tensor, chosen: Tensor) -> Tensor:
-    return values.gather(2, chosen[..., None]).squeeze(2)
-
-
 def chosen_errors(
     population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor, weight: float = 1.0
 ) -> Tensor:
@@ -210,7 +197,8 @@ def chosen_errors(
     """
     compiled = _sweep_of(population)
     if compiled is None or not compilable(x, aims):
-        errors = _chosen(population(x), chosen) - aims
+        values: Tensor = population(x)
+        errors = values.gather(2, chosen[..., None]).squeeze(2) - aims
         gradients(weight * errors.square().mean(1).sum(), population)
         return errors.detach()
     seen, places, wanted = (each.detach().contiguous().numpy() for each in (x, chosen, aims))
@@ -563,6 +551,7 @@ class Adam:
         self._named = [(name, p) for name, p in population.named_parameters() if p.requires_grad]
         if not self._named:
             raise ValueError("a population without trainable parameters has nothing to optimize")
+        self._parameters = [p for _, p in self._named]
         self.rates = {
             name: (quantum_lr if name in quantum else classical_lr) * factors.get(name, 1.0)
             for name, _ in self._named
@@ -594,12 +583,14 @@ class Adam:
         for _, parameter in self._named:
             parameter.grad = None
 
-    @torch.no_grad()
     def step(self, active: Tensor | None = None) -> None:
         """Move every agent, or only the ones with a true `active` (S,), along its gradient."""
         self.steps += 1 if active is None else active.to(self.steps)
-        if self._compiled and self.steps.is_cpu and self._move(active):
-            return
+        if not (self._compiled and self.steps.is_cpu and self._move(active)):
+            self._move_by_torch(active)
+
+    @torch.no_grad()
+    def _move_by_torch(self, active: Tensor | None) -> None:
         beta1, beta2 = self.betas
         count = self.steps.clamp(min=1)
         if self.steps.is_cpu:
@@ -642,38 +633,44 @@ class Adam:
 
     def _move(self, active: Tensor | None) -> bool:
         """Make the step in one compiled pass, for which parameters come to lie in one block; False if torch has to."""
-        parameters = [p for _, p in self._named]
-        if any(p.grad is None for p in parameters):
-            return False
         whole = _sweep_of(self._population)  # first: it may move parameters
-        if self._blocks is None or self._blocks[0] != [p.data_ptr() for p in parameters]:
-            if not compilable(*parameters):
+        gradients = None if whole is None else whole.gradients_of(self._parameters)
+        if gradients is None and any(p.grad is None for p in self._parameters):
+            return False
+        if self._blocks is None or self._blocks[0] != [p.data_ptr() for p in self._parameters]:
+            if not compilable(*self._parameters):
                 return False
-            self._blocks = self._lay_out(parameters)
-        from qrlsuite.compiled import networks
-        from qrlsuite.compiled.perceptron import joined
+            self._blocks = self._lay_out(self._parameters)
+        _, move, block, means, squares, sizes, rates, roots, everyone, constants = self._blocks
+        if gradients is None:
+            from qrlsuite.compiled.perceptron import joined
 
-        _, block, means, squares, sizes, rates, constants = self._blocks
+            gradients = joined([cast("Tensor", p.grad) for p in self._parameters])
         for row, (name, _) in zip(rates, self._named):
             row[:] = self.rates[name]
         counts = self.steps.tolist()
         scale: Any
         if counts.count(counts[0]) == len(counts):
-            scale, root = _corrections(*self.betas, max(counts[0], 1))
-            roots = np.full(len(counts), root, np.float32)
+            scale, roots[:] = _corrections(*self.betas, max(counts[0], 1))
         else:
-            scale, root = np.array([_corrections(*self.betas, max(count, 1)) for count in counts]).T
-            roots = root.astype(np.float32)
-        gradients = None if whole is None else whole.gradients_of(parameters)
-        if gradients is None:
-            gradients = joined([cast("Tensor", p.grad) for p in parameters])
-        moved = np.ones(len(counts), np.bool_) if active is None else active.cpu().numpy()
-        corrected = (rates * scale).astype(np.float32)
-        networks.adam(block, gradients, means, squares, sizes, corrected, roots, moved, *constants)
+            scale, roots[:] = np.array([_corrections(*self.betas, max(count, 1)) for count in counts]).T
+        moved = everyone if active is None else active.cpu().numpy()
+        move(
+            block,
+            gradients,
+            means,
+            squares,
+            sizes,
+            (rates * scale).astype(np.float32),
+            roots,
+            moved,
+            *constants,
+        )
         return True
 
     def _lay_out(self, parameters: Sequence[Tensor]) -> tuple[Any, ...]:
-        """Return where parameters are; they and both moments, each in one block; sizes, and room for learning rates."""
+        """Return where parameters are, and the arguments of the compiled step, for which all lie in blocks."""
+        from qrlsuite.compiled.networks import adam
         from qrlsuite.compiled.perceptron import in_one_block, joined
 
         self.mean, self.square = (
@@ -682,12 +679,17 @@ class Adam:
         moments = [list(own.values()) for own in (self.mean, self.square)]
         for part in (parameters, *moments):
             in_one_block(part)
-        rates = np.empty((len(parameters), len(self.steps)))
+        agents = len(self.steps)
+        rates, roots, everyone = (
+            np.empty((len(parameters), agents)),
+            np.empty(agents, np.float32),
+            np.ones(agents, bool),
+        )
         sizes = np.array([p[0].numel() for p in parameters])
         blocks = (joined(part) for part in (parameters, *moments))
         beta1, beta2 = self.betas
         constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
-        return [p.data_ptr() for p in parameters], *blocks, sizes, rates, constants
+        return [p.data_ptr() for p in parameters], adam, *blocks, sizes, rates, roots, everyone, constants
 
     def gradient_norms(self) -> dict[str, NDArray[np.float64]]:
         """Return the norms of each agent's gradients, for the metrics of an epoch.
@@ -787,8 +789,8 @@ def renew(target: nn.Module, population: nn.Module, steps: Tensor, every: Tensor
 
 def by_seed(lanes: NDArray[Any], seeds: int, device: torch.device) -> Tensor:
     """Return values of seed-major lanes, (S * E, ...) of any type, as float32 of shape (S, E, features)."""
-    values = np.ascontiguousarray(lanes, np.float32)
-    return torch.from_numpy(values).view(seeds, len(values) // seeds, -1).to(device)
+    values = np.ascontiguousarray(lanes, np.float32).reshape(seeds, len(lanes) // seeds, -1)
+    return torch.from_numpy(values).to(device)
 
 
 def prefixed(**parts: Mapping[str, Tensor]) -> dict[str, Tensor]:

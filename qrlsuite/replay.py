@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -34,11 +37,7 @@ class Replay:
         self._stored = 0
         self._count = None if self.rows.is_cpu else torch.zeros((), dtype=torch.int64, device=device)
         """`stored` on the device, where rounds read it."""
-        self._borders = [0, *itertools.accumulate(columns.values())]
-        blocks = list(zip(self._borders, columns.values()))
-        self._starts, self._within, self._widths = np.array(
-            [(first, column, width) for first, width in blocks for column in range(width)], np.uint64
-        ).T.copy()
+        self._borders = np.array([0, *itertools.accumulate(columns.values())])
 
     @property
     def stored(self) -> int:
@@ -56,17 +55,25 @@ class Replay:
         """Rows that each seed holds now."""
         return min(self.stored, self.rows.shape[1])
 
-    def add(self, **values: Tensor) -> None:
-        """Store E rows of every seed, over the oldest ones: each quantity (S, E, numbers), or (S, E)."""
-        capacity, new = self.rows.shape[1], len(values[next(iter(self.columns))][0])
-        place = self.stored % capacity
+    def add(self, **values: Tensor | NDArray[Any]) -> None:
+        """Store E rows of every seed, over the oldest ones: each quantity (S, E, numbers), or lanes (S E, ...)."""
+        (seeds, capacity, _), widths = self.rows.shape, self.columns.values()
+        given = [values[name] for name in self.columns]
+        new = math.prod(given[0].shape) // seeds // int(self._borders[1])
+        place = self._stored % capacity
         if place + new <= capacity and self.rows.is_cpu:
             held = self.rows.numpy()[:, place : place + new]
-            for name, first, end in zip(self.columns, self._borders, self._borders[1:]):
-                held[:, :, first:end] = values[name].detach().numpy().reshape(len(held), new, -1)
+            for each, width, first in zip(given, widths, self._borders):
+                part = each.numpy(force=True) if isinstance(each, Tensor) else each
+                held[:, :, first : first + width] = part.reshape(seeds, new, width)
         else:
-            parts = [values[name].to(torch.float32) for name in self.columns]
-            both = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
+            both = torch.cat(
+                [
+                    torch.as_tensor(each).to(self.rows).reshape(seeds, new, width)
+                    for each, width in zip(given, widths)
+                ],
+                2,
+            )
             start: int | Tensor = self._stored if self._count is None else self._count
             self.rows[:, (start + torch.arange(new, device=self.rows.device)) % capacity] = both
         self._stored += new
@@ -88,25 +95,26 @@ class Replay:
         """Return the rows at `places` (S, B) of every seed, as `batch` does."""
         seeds, capacity, numbers = self.rows.shape
         if self.rows.is_cpu:
-            return self._picked(places)
+            found = self._picked(places.contiguous().numpy())
+            return {name: torch.from_numpy(part) for name, part in found.items()}
         offset = torch.arange(seeds, device=self.rows.device)[:, None] * capacity
-        found = self.rows.view(-1, numbers)[(places + offset).reshape(-1)].view(seeds, -1, numbers)
-        parts = torch.split(found, list(self.columns.values()), dim=2)
+        rows = self.rows.view(-1, numbers)[(places + offset).reshape(-1)].view(seeds, -1, numbers)
+        parts = torch.split(rows, list(self.columns.values()), dim=2)
         return {name: part.contiguous() for name, part in zip(self.columns, parts)}
 
-    def _picked(self, places: Tensor) -> dict[str, Tensor]:
-        """Like `at`, by one compiled loop."""
+    def arrays(self, draws: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
+        """Return what `batch` does, of a buffer on the CPU."""
+        return self._picked((draws * self.filled).astype(np.int64))
+
+    def _picked(self, places: NDArray[np.int64]) -> dict[str, NDArray[np.float32]]:
+        """Return rows on the CPU, by one compiled loop."""
         from qrlsuite.compiled.networks import pick
 
-        seeds, batch = places.shape
-        samples, parts = seeds * batch, {}
-        out, first = np.empty(samples * self._borders[-1], np.float32), 0
-        begin = self._starts * np.uint64(samples) + self._within
-        rows = self.rows.view(-1).numpy()
-        pick(rows, self.rows.shape[1], places.contiguous().numpy(), begin, self._widths, out)
-        for (name, width), end in zip(self.columns.items(), self._borders[1:]):
-            parts[name] = torch.from_numpy(out[first : samples * end].reshape(seeds, batch, width))
-            first = samples * end
+        out, parts, end = np.empty(places.size * self.rows.shape[2], np.float32), {}, 0
+        pick(self.rows.numpy(), places, self._borders, out)
+        for name, width in self.columns.items():
+            first, end = end, end + places.size * width
+            parts[name] = out[first:end].reshape(*places.shape, width)
         return parts
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -35,9 +35,12 @@ from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import Adam, DecaySteps, by_seed, chosen_errors, chosen_values, part, prefixed, renew
+from qrlsuite.population import Adam, DecaySteps, by_seed, chosen_errors, part, prefixed, renew, sweeps
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
+
+if TYPE_CHECKING:
+    from qrlsuite.compiled.perceptron import Sweep
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -120,15 +123,16 @@ class DDQN:
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
-        losses = torch.zeros(self.S, dtype=torch.float64, device=self.device)
+        errors = torch.empty((rounds, self.S, self.options.batch), device=self.device)
         self.adam.decay(self.epoch * rounds * self.E, self.options.decay_steps)
-        for k, (explore, action, draws) in enumerate(zip(*self._epoch_numbers(rounds))):
+        for k, (explore, action, draws, found) in enumerate(zip(*self._epoch_numbers(rounds), errors)):
             greedy = self._greedy(self.observations)
             uniform = masks.drawn(action, self.observations, self.obs_dim, self.streams, self.epoch, k)
             self._interact(torch.where(explore, uniform, greedy))  # (S, E)
-            losses += self._learn(draws)
+            found.copy_(self._learn(draws))
         self.epoch += 1
-        return {"loss": (losses / rounds).cpu().numpy(), **self.adam.gradient_norms()}
+        losses = errors.square().mean(2).cpu().double().cumsum(0)[-1]  # in the order of rounds
+        return {"loss": (losses / rounds).numpy(), **self.adam.gradient_norms()}
 
     def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
         """Draw an epoch's exploration (rounds, S, E), twice, and replay positions (rounds, S, batch) in [0, 1)."""
@@ -154,26 +158,37 @@ class DDQN:
         after, rewards, terminated, _, infos = self.envs.step(lanes)
         arrival = masks.behind(by_seed(arrived(after, infos), self.S, self.device), infos, arrived=True)
         self.replay.add(
-            seen=self.observations,
-            after=arrival,
-            action=actions,
-            reward=by_seed(rewards, self.S, self.device),
-            alive=by_seed(~terminated, self.S, self.device),
+            seen=self.observations, after=arrival, action=lanes, reward=rewards, alive=~terminated
         )
         self.observations = masks.behind(by_seed(after, self.S, self.device), infos) if infos else arrival
 
     def _learn(self, draws: Tensor) -> Tensor:
-        """Make one Adam step of every agent on a batch drawn by `draws` (S, batch); returns the losses (S,)."""
+        """Make one Adam step of every agent on a batch drawn by `draws` (S, batch); returns Q(s, a) - y (S, batch)."""
+        masked = self.seen_dim > self.obs_dim
+        whole = None if masked or self.device.type != "cpu" else sweeps(self.online, self.target)
+        errors = self._errors(draws) if whole is None else self._swept_errors(draws, *whole)
+        self.adam.step()
+        renew(self.target, self.online, self.adam.steps, self.target_steps)
+        return errors
+
+    def _errors(self, draws: Tensor) -> Tensor:
+        """Return Q(s, a) - y (S, batch), and set its gradients."""
         batch = self.replay.batch(draws)
         action, reward, alive = (batch[name].squeeze(2) for name in ("action", "reward", "alive"))
         seen, after = (masks.observed(batch[name], self.obs_dim) for name in ("seen", "after"))
-        y = reward + self.options.gamma * alive * chosen_values(
-            self.target, after, self._greedy(batch["after"])
-        )
-        errors = chosen_errors(self.online, seen, action.long(), y)  # Q(s, a) - y; sets gradients
-        self.adam.step()
-        renew(self.target, self.online, self.adam.steps, self.target_steps)
-        return errors.square().mean(1)
+        with torch.no_grad():
+            best = self._greedy(batch["after"])
+            following = self.target(after).gather(2, best[..., None]).squeeze(2)
+        y = reward + self.options.gamma * alive * following
+        return chosen_errors(self.online, seen, action.long(), y)
+
+    def _swept_errors(self, draws: Tensor, online: Sweep, target: Sweep) -> Tensor:
+        """Like `_errors`, where networks are compiled sweeps; the bits are equal."""
+        batch = self.replay.arrays(draws.numpy())
+        action, reward, alive = (batch[name][..., 0] for name in ("action", "reward", "alive"))
+        following = target.chosen(batch["after"], online.best(batch["after"]))
+        y = reward + self.options.gamma * alive * following
+        return torch.from_numpy(online.chosen_errors(batch["seen"], action.astype(np.int64), y))
 
     def _greedy(self, seen: Tensor) -> Tensor:
         return masks.best(self.online, seen, self.obs_dim)

@@ -320,11 +320,13 @@ def largest(values: Any, places: Any) -> None:
     """Write where values (S, B, A) are the largest (S, B): the first of equal ones, and of NaN, which is above all."""
     for s in range(values.shape[0]):
         for b in range(values.shape[1]):
-            place = 0
+            place, found = 0, values[s, b, 0]
             for a in range(1, values.shape[2]):
-                here, found = values[s, b, a], values[s, b, place]
-                if here > found or (here != here and found == found):
-                    place = a
+                here = values[s, b, a]
+                better = (here > found) | (
+                    (here != here) & (found == found)
+                )  # no branch, which would be guessed
+                place, found = (a if better else place), (here if better else found)
             places[s, b] = place
 
 
@@ -360,22 +362,20 @@ def chosen_errors(values: Any, places: Any, aims: Any, share: Any, errors: Any, 
 
 
 @kernel
-def pick(rows: Any, capacity: int, places: Any, first: Any, width: Any, out: Any) -> None:
-    """Write rows (S, capacity, N) at `places` (S, B) in blocks of columns.
+def pick(rows: Any, places: Any, borders: Any, out: Any) -> None:
+    """Write rows (S, capacity, N) at `places` (S, B), quantity by quantity: columns borders[k] to borders[k + 1].
 
-    Parameters
-    ----------
-    first, width:
-        Of each column, its place in the first row of its block in `out`, and the numbers of a row there.
+    Columns are copied one by one: a loop over a batch waits for all its rows at once.
     """
     seeds, batch = places.shape
-    columns = np.uint64(len(first))
     for s in range(seeds):
-        for b in range(batch):
-            begin = np.uint64(s * capacity + places[s, b]) * columns
-            sample = np.uint64(s * batch + b)
-            for c in range(columns):
-                out[first[c] + sample * width[c]] = rows[begin + c]
+        own, chosen = rows[s], places[s]
+        for k in range(len(borders) - 1):
+            first, width = borders[k], borders[k + 1] - borders[k]
+            for c in range(width):
+                column, to = first + c, first * seeds * batch + s * batch * width + c
+                for b in range(batch):
+                    out[to + b * width] = own[chosen[b], column]
 
 
 @rounded

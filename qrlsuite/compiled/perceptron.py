@@ -24,6 +24,8 @@ WIDE = 2 * vectors.lanes(np.float32)
 _spare: dict[tuple[str, int, int], Any] = {}
 
 Array = NDArray[np.float32]
+_NOTHING: Array = np.empty(1, np.float32)
+_NOWHERE: Array = np.empty((1, 1, 1), np.float32)
 
 
 def perceptron(
@@ -214,19 +216,10 @@ class LayersSweep(Sweep):
     ) -> None:
         pair, turned, sums = (Records(*shape) for shape in self.shapes_of_work)
         networks.backward(
-            cotangents,
-            self.parameters,
-            self.sizes,
-            self.code,
-            records.array,
-            pair.array,
-            turned.array.reshape(-1),
-            sums.array.reshape(-1),
-            np.empty(1, np.float32) if gradients is None else gradients,
-            gradients is not None,
-            np.empty((1, 1, 1), np.float32) if x_gradient is None else x_gradient,
-            x_gradient is not None,
-        )
+            cotangents, self.parameters, self.sizes, self.code, records.array, pair.array, turned.array.reshape(-1),
+            sums.array.reshape(-1), _NOTHING if gradients is None else gradients, gradients is not None,
+            _NOWHERE if x_gradient is None else x_gradient, x_gradient is not None,
+        )  # fmt: skip
         if x_gradient is not None and self.scale is not None:
             x_gradient *= self.scale
 

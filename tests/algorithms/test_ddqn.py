@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from qrlsuite.plugins.algorithms.ddqn import DDQN
-from qrlsuite.population import Adam
+from qrlsuite.population import Adam, sweeps
 from tests.algorithms.worlds import Clock, Contexts, Group, Perceptron, Table
 
 
@@ -24,7 +24,7 @@ def tabular(transition: list[float]) -> DDQN:
 
 
 def loss(made: DDQN) -> float:
-    return float(made._learn(torch.zeros((1, 1), dtype=torch.float64))[0])
+    return float(made._learn(torch.zeros((1, 1), dtype=torch.float64))[0, 0] ** 2)
 
 
 def test_the_online_network_picks_and_the_target_network_rates() -> None:
@@ -49,7 +49,7 @@ def test_first_update_is_that_of_an_independent_computation() -> None:
     picked = torch.randint(20, (2, 8), generator=generator)
     online = [Perceptron(made.online, s) for s in range(2)]
     target = [Perceptron(made.target, s) for s in range(2)]
-    losses = made._learn((picked + 0.5).double() / 20).numpy()
+    losses = made._learn((picked + 0.5).double() / 20).square().mean(1).numpy()
     for s in range(2):
         batch = rows[s].numpy().astype(np.float64)[picked[s].numpy()]
         states, following, (action, reward, alive) = batch[:, :4], batch[:, 4:8], batch[:, 8:].T
@@ -62,6 +62,23 @@ def test_first_update_is_that_of_an_independent_computation() -> None:
         d = np.zeros_like(values)
         d[range(8), action] = 2 * error / 8
         online[s].assert_updated(made.online, d, 2e-3, s)
+
+
+def test_steps_without_autograd_have_its_bits() -> None:
+    compiled, plain = (
+        Group("ddqn", [0, 1], Contexts(2), batch=50, target_steps=5, buffer=30).start().algorithm
+        for _ in range(2)
+    )
+    for network in (plain.online, plain.target):
+        network.register_forward_hook(lambda *given: None)  # which a compiled pass would not call
+    assert (sweeps(compiled.online, compiled.target) is None, sweeps(plain.online, plain.target)) == (
+        False,
+        None,
+    )
+    losses = [each.train_epoch(20)["loss"] for each in (compiled, plain)]
+    assert (losses[0] == losses[1]).all()
+    for ours, theirs in zip(compiled.state_dict().values(), plain.state_dict().values(), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_target_is_copied_after_every_so_many_gradient_steps() -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from qrlsuite.compiled import networks, perceptron, vectors
 from qrlsuite.plugins.models import mlp
-from qrlsuite.population import ACTIVATIONS, Adam, best, chosen_errors, chosen_values, held, layers
+from qrlsuite.population import ACTIVATIONS, Adam, best, chosen_errors, held, layers
 
 SIZES = [(3, 16, 16, 3), (3, 10, 1), (5, 7), (1, 1, 1), (2, 33, 18, 64, 4), (40, 8, 2)]
 
@@ -254,7 +254,9 @@ def test_errors_without_autograd_have_its_bits_and_those_of_the_steps_that_follo
         errors = [chosen_errors(each, x, chosen, aims, weight) for each in (ours, theirs)]
         assert torch.equal(*errors)
         assert torch.equal(*(best(each, x) for each in (ours, theirs)))
-        assert torch.equal(*(chosen_values(each, x, chosen) for each in (ours, theirs)))
+        if (sweep := ours.sweep()) is not None:
+            found = torch.from_numpy(sweep.chosen(x.numpy(), chosen.numpy()))
+            assert torch.equal(found, theirs(x).gather(2, chosen[..., None])[..., 0])
         for p, q in zip(ours.parameters(), theirs.parameters()):
             assert torch.equal(p.grad, q.grad)  # type: ignore[arg-type]
         for adam in adams:
@@ -278,9 +280,14 @@ def test_errors_without_autograd_have_its_bits_and_those_of_the_steps_that_follo
 def test_what_is_no_output_is_not_chosen(chosen: Tensor) -> None:
     options, g = mlp.MLPOptions(width=12), torch.Generator()
     population = mlp.population([mlp.build(3, 4, options, g) for _ in range(2)], options)
-    for call in (chosen_values, lambda *given: chosen_errors(*given, torch.zeros(2, 5))):
+    sweep, x = population.sweep(), torch.zeros(2, 5, 3)
+    assert sweep is not None
+    for call in (
+        lambda: sweep.chosen(x.numpy(), chosen.numpy()),
+        lambda: chosen_errors(population, x, chosen, torch.zeros(2, 5)),
+    ):
         with pytest.raises(ValueError, match="choose one of 4 outputs of each sample"):
-            call(population, torch.zeros(2, 5, 3), chosen)
+            call()
 
 
 def test_a_moved_or_changed_parameter_is_seen() -> None:

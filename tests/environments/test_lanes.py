@@ -40,7 +40,7 @@ def test_observations_and_states_are_copies(name: str) -> None:
         np.testing.assert_array_equal(values, before[key])
 
 
-@pytest.mark.parametrize("name", ["cartpole", "gym"])
+@all_lanes
 def test_without_autoreset_an_ended_lane_stays_put_also_when_it_is_resumed(name: str) -> None:
     env, other, last, resumed = lanes(name, 3), lanes(name, 3), dict[int, Any](), False
     env.autoreset = other.autoreset = False

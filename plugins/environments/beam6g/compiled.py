@@ -1,4 +1,4 @@
-"""The compiled loops of `trajectory`: path by path, every operation in the order and rounding of numpy's."""
+"""The compiled loops of paths and of steps: every operation in the order and rounding of numpy's."""
 
 from __future__ import annotations
 
@@ -130,3 +130,113 @@ def walk(
                 u = u * local + along_x[piece, j, b]
                 v = v * local + along_y[piece, j, b]
             x[b, k], y[b, k] = u, v
+
+
+@rounded
+def serve(
+    actions: Any, intensity: Any, beam: Any, last_beam: int, step: Any, received: Any, observations: Any, rewards: Any,
+    ends: Any,
+) -> bool:  # fmt: skip
+    """Let antennas `actions` (L,) serve the lanes whose episodes go on; return False, and do nothing, if one is none.
+
+    Parameters
+    ----------
+    intensity, beam:
+        Tables (L, A, K + 1), see `Tables`.
+    last_beam:
+        The number of the codebook's last beam.
+    step, received, observations:
+        Changed in place: (L,), (L,) and (L, 3 stack), into which a step shifts three numbers.
+    rewards, ends:
+        Written: (L,) each; whether an episode ends.
+    """
+    antennas, last = intensity.shape[1], intensity.shape[2] - 1
+    for lane in range(actions.shape[0]):
+        if not 0 <= actions[lane] < antennas:
+            return False
+    for lane in range(actions.shape[0]):
+        goes_on = step[lane] < last
+        rewards[lane], ends[lane] = 0.0, False
+        if goes_on:
+            step[lane] += 1
+            antenna, k, seen = actions[lane], step[lane], observations[lane]
+            rewards[lane], ends[lane] = intensity[lane, antenna, k], k == last
+            received[lane] += rewards[lane]
+            for i in range(seen.shape[0] - 3):
+                seen[i] = seen[i + 3]
+            seen[-3] = antenna / (antennas - 1)
+            seen[-2] = rewards[lane]
+            seen[-1] = beam[lane, antenna, k] / last_beam
+    return True
+
+
+@rounded
+def aim(
+    x: Any,
+    y: Any,
+    antennas: Any,
+    borders: Any,
+    best: Any,
+    phases: Any,
+    lanes: Any,
+    halves: Any,
+    r2: Any,
+    beam: Any,
+) -> None:
+    """Write how every antenna sees users at x, y (B, K + 1): half of xi, and R^2, (B, A, K + 1); see `physics`.
+
+    Parameters
+    ----------
+    antennas:
+        Positions and orientations (A, 4).
+    borders, best, phases:
+        The physics's `steps`, `best` and `phases`.
+    lanes, beam:
+        The best beam goes to the rows `lanes` (B,) of `beam`, (L, A, K + 1).
+    """
+    for b in range(x.shape[0]):
+        for a in range(antennas.shape[0]):
+            piece = 0  # that of the last step, which is near
+            for k in range(x.shape[1]):
+                dx, dy = x[b, k] - antennas[a, 0], y[b, k] - antennas[a, 1]
+                square = dx * dx + dy * dy + 1.0
+                u = (dx * antennas[a, 2] + dy * antennas[a, 3]) / np.sqrt(square) * np.pi
+                while piece < borders.shape[0] and borders[piece] <= u:
+                    piece += 1
+                while piece > 0 and borders[piece - 1] > u:
+                    piece -= 1
+                chosen = best[piece]
+                halves[b, a, k], r2[b, a, k] = (u - phases[chosen]) * 0.5, square
+                beam[lanes[b], a, k] = chosen
+
+
+@rounded
+def tabulate(
+    below: Any, above: Any, r2: Any, senders: float, fourth_power: bool, peak: float, lanes: Any, intensity: Any,
+    optimal: Any,
+) -> None:  # fmt: skip
+    """Write intensities (L, A, K + 1), and the sums of the best antenna's (L,), to the rows `lanes`; see `physics`.
+
+    Parameters
+    ----------
+    below, above:
+        The sines of half of xi and of so many times that, (B, A, K + 1), as numpy has them.
+    """
+    for b in range(r2.shape[0]):
+        lane, total = lanes[b], 0.0
+        for k in range(r2.shape[2]):
+            most = 0.0
+            for a in range(r2.shape[1]):
+                sine, square, fall = (
+                    below[b, a, k] * below[b, a, k],
+                    above[b, a, k] * above[b, a, k],
+                    r2[b, a, k],
+                )
+                if sine <= peak:
+                    value = 1.0 / fall
+                else:
+                    value = square / (sine * (fall * fall if fourth_power else fall) * (senders * senders))
+                intensity[lane, a, k] = value
+                most = max(most, value)
+            total += most  # in the order of the steps
+        optimal[lane] = total

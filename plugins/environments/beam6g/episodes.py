@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.beam6g import physics, trajectory
 from qrlsuite.plugins.environments.beam6g.options import BeamOptions
-from qrlsuite.plugins.environments.beam6g.physics import BEAMS, FIELD, BeamArray, FloatArray
+from qrlsuite.plugins.environments.beam6g.physics import BEAMS, FIELD, SENDERS, BeamArray, FloatArray
 
-_BLOCK = 128
+_BLOCK = 32
+"""Episodes that are tabulated at once: so many stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,17 +81,26 @@ class EpisodeGenerator:
 
     def fill(self, tables: Tables, lanes: NDArray[np.intp], support: FloatArray) -> None:
         """Tabulate the episodes of paths (len(lanes), degree, 2) into the rows `lanes` of `tables`."""
+        from qrlsuite.plugins.environments.beam6g import compiled
+
+        own, antennas = self.physics, np.array(self.options.antennas).reshape(-1, 4)
         for first in range(0, len(lanes), _BLOCK):
             rows = lanes[first : first + _BLOCK]
             x, y = trajectory.positions(support[first : first + _BLOCK], self.options.steps)
-            best = np.zeros_like(x)
-            for i, antenna in enumerate(self.options.antennas):
-                intensity, beam = physics.best_intensity(self.physics, x, y, antenna)
-                tables.intensity[rows, i] = intensity
-                tables.beam[rows, i] = beam
-                np.maximum(best, intensity, out=best)
-            # A cumulative sum adds in the order of the steps; np.sum would add pairwise.
-            tables.optimal[rows] = np.cumsum(best, axis=1)[:, -1]
+            halves, r2 = np.empty((2, len(rows), len(antennas), self.options.steps + 1))
+            compiled.aim(x, y, antennas, own.steps, own.best, own.phases, rows, halves, r2, tables.beam)
+            below, above = np.sin(halves), np.sin(halves * SENDERS)  # numpy's, whose bits numba's need not be
+            compiled.tabulate(
+                below,
+                above,
+                r2,
+                float(SENDERS),
+                own.fourth_power,
+                own.peak,
+                rows,
+                tables.intensity,
+                tables.optimal,
+            )
 
     def observation(
         self, antenna: NDArray[np.int64], intensity: FloatArray, beam: BeamArray

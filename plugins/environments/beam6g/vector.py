@@ -15,6 +15,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.episodes import EpisodeGenerator, Tables, reset_options
 from qrlsuite.plugins.environments.beam6g.options import BeamOptions, parse
+from qrlsuite.plugins.environments.beam6g.physics import BEAMS
 
 
 class BeamLanes(LaneEnv):
@@ -69,26 +70,25 @@ class BeamLanes(LaneEnv):
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
         """Let antenna `actions` (L,) serve each lane's user at its next position."""
+        from qrlsuite.plugins.environments.beam6g import compiled
+
         if self._support is None:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
-        antennas = len(self.options.antennas)
         if actions.shape != (self.num_envs,) or actions.dtype.kind not in "iu":
             raise InvalidAction(
                 f"actions must be {self.num_envs} integers, not {actions.dtype} of shape {actions.shape}"
             )
-        if actions.min() < 0 or actions.max() >= antennas:
-            raise InvalidAction(
-                f"actions must lie in 0..{antennas - 1}, not {actions.min()}..{actions.max()}"
-            )
         tables = self.tabulate()
-        self._step += 1
-        steps = self.options.steps
-        index = (self._lane * antennas + actions) * (steps + 1) + self._step
-        rewards = tables.intensity.take(index)
-        self._received += rewards
-        self._observe(self._simulator.observation(actions, rewards, tables.beam.take(index)))
-        terminated = self._step == steps
+        rewards, terminated = np.empty(self.num_envs), np.empty(self.num_envs, np.bool_)
+        served = compiled.serve(
+            np.ascontiguousarray(actions, np.int64), tables.intensity, tables.beam, BEAMS - 1, self._step,
+            self._received, self._observations, rewards, terminated,
+        )  # fmt: skip
+        if not served:
+            raise InvalidAction(
+                f"actions must lie in 0..{len(self.options.antennas) - 1}, not {actions.min()}..{actions.max()}"
+            )
         infos: dict[str, Any] = {}
         if terminated.any():
             infos = self._finish(tables, terminated)
@@ -166,14 +166,8 @@ class BeamLanes(LaneEnv):
             self._pending[:] = False
         return self._tables
 
-    def _observe(self, newest: NDArray[np.float32]) -> None:
-        """Shift the stacked observations by one and append `newest` (L, 3)."""
-        if self.options.stack > 1:
-            self._observations[:, :-3] = self._observations[:, 3:].copy()
-        self._observations[:, -3:] = newest
-
     def _finish(self, tables: Tables, done: NDArray[np.bool_]) -> dict[str, Any]:
-        """Report the episodes that end and begin the next ones in their lanes."""
+        """Report the episodes that end and, with `autoreset`, begin the next ones in their lanes."""
         final: dict[str, Any] = {}
         for name, values in (
             ("score", self._received / tables.optimal),
@@ -188,7 +182,8 @@ class BeamLanes(LaneEnv):
             "final_info": final,
             "_final_info": done.copy(),
         }
-        self._begin(np.flatnonzero(done))
+        if self.autoreset:
+            self._begin(np.flatnonzero(done))
         return infos
 
 
