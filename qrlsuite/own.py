@@ -498,7 +498,6 @@ def _finder(path: str) -> FileFinder:
 
 
 def _recognized(module: ModuleType, source: Source) -> list[Registered[Any]]:
-    """Return the short forms in a module."""
     if short := shortforms.recognized(module):
         return [_registered(thing, module, source, _place(thing)) for thing in short]
     advice = f"write {shortforms.FORMS}, or call qrlsuite.register(...)"

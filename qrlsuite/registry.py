@@ -219,7 +219,6 @@ class Registry:
 def _collect(
     handed: list[Registered[Any]], kind: type[specs.Spec], distribution: str, spec: specs.Spec
 ) -> None:
-    """Collect a spec that a hook registers."""
     if type(spec) is not kind:
         raise PluginError(f"register() needs a {kind.__name__}, got {type(spec).__name__}")
     caller = sys._getframe(1)

@@ -261,7 +261,6 @@ class _Holder:
         self.module, self.name = module, name
 
     def put(self, word: str, value: Any) -> str:
-        """Return the reference to a value."""
         attribute = f"{PRIVATE}{self.name}_{word}"
         known = str(value.__name__)
         if isinstance(value, type) and getattr(self.module, known, None) is value:
@@ -475,7 +474,6 @@ def _hints(thing: Any) -> Mapping[str, Any]:
 def _field(
     thing: Callable[..., Any], parameter: inspect.Parameter, hints: Mapping[str, Any]
 ) -> tuple[str, Any, Any]:
-    """Return a parameter as a field of the options class."""
     name, default = parameter.name, parameter.default
     if default is parameter.empty:
         kind = parameter.annotation if isinstance(parameter.annotation, str) else "int"

@@ -126,7 +126,6 @@ class PairVerdict:
 
     @property
     def _by_steps(self) -> str:
-        """The verdict by steps."""
         pair = self.times
         if (pair.at_cap == 1).all():
             return (

@@ -33,12 +33,7 @@ class BarsOptions:
     deltas: Annotated[list[float], Field(min_length=1, description="the threshold probabilities")] = Field(
         default_factory=lambda: [0.5, 0.75]
     )
-    horizon: Annotated[
-        int | None,
-        Field(
-            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
-        ),
-    ] = None
+    horizon: cells.Horizon = None
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards.ranked import learning_curves
@@ -13,6 +16,11 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults, edited_between
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 from qrlsuite.statistics.grid import BoolArray, FloatArray
+
+Horizon = Annotated[
+    int | None,
+    Field(ge=1, description="environment steps at which sample complexity is capped; by default the task's"),
+]
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,7 +137,6 @@ def summaries() -> dict[str, str]:
 
 
 def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
-    """Return the pictures that environments bring: by picture, then by environment."""
     by_name: dict[str, dict[str, PictureSpec]] = {}
     for registered in registry.load().of(specs.EnvironmentSpec).values():
         for picture in registered.spec.pictures:

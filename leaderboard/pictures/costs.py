@@ -37,12 +37,7 @@ class CostsOptions:
         list[float] | None,
         Field(min_length=1, max_length=1, description="one; by default the reference cell's"),
     ] = None
-    horizon: Annotated[
-        int | None,
-        Field(
-            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
-        ),
-    ] = None
+    horizon: cells.Horizon = None
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:

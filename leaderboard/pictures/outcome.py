@@ -212,7 +212,6 @@ def _ratios(axes: Axes, ends: Sequence[float], margin: float) -> None:
 
 
 def _legend(axes: Axes, pairs: Sequence[PairDecision]) -> None:
-    """Add a legend of the verdicts."""
     for each, (label, color, marker) in LOOKS.items():
         if any(pair.decided is each for pair in pairs):
             axes.plot([], [], marker, color=color, label=label, ls="none")

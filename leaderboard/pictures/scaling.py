@@ -38,12 +38,7 @@ class ScalingOptions:
         list[float] | None, Field(description="by default the reference cell's; several make several panels")
     ] = None
     deltas: Annotated[list[float] | None, Field(description="by default the reference cell's")] = None
-    horizon: Annotated[
-        int | None,
-        Field(
-            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
-        ),
-    ] = None
+    horizon: cells.Horizon = None
 
 
 @plain_dataclass(frozen=True)

@@ -33,12 +33,7 @@ class SurfaceOptions:
     deltas: Annotated[
         list[float] | None, Field(description="columns; by default of the task's ranking grid")
     ] = None
-    horizon: Annotated[
-        int | None,
-        Field(
-            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
-        ),
-    ] = None
+    horizon: cells.Horizon = None
     elevation: Annotated[float, Field(description="3d: the viewer's height, degrees")] = 22
     azimuth: Annotated[float, Field(description="3d: the viewer's direction, degrees")] = -128
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
@@ -33,12 +32,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 class TiersOptions:
     """Settings of the tiers."""
 
-    horizon: Annotated[
-        int | None,
-        Field(
-            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
-        ),
-    ] = None
+    horizon: cells.Horizon = None
 
 
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:

@@ -51,7 +51,6 @@ def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _commit(base: str, root: Path) -> str:
-    """Return a commit's digits."""
     problem = f"--base {base!r} names no commit here: write one, such as origin/main or HEAD~1"
     if base.startswith("-"):  # git would take it for an option
         raise OptionError(problem)

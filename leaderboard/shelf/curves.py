@@ -312,7 +312,6 @@ class EntryResults(Shown):
 
     @cached_property
     def _made_with(self) -> list[Provenance]:
-        """What made the seeds, each once."""
         made = (made for record in self._run_records for made in record.provenance)
         return list({id(each): each for each in made}.values())
 

@@ -214,7 +214,6 @@ def _flatten(prefix: str, values: object, found: dict[str, Any]) -> None:
 
 
 def _option_columns(entries: Sequence[EntryResults]) -> dict[str, pyarrow.Array]:
-    """Return a column for each option, with a value for each entry."""
     each = [options_of(entry.identity) for entry in entries]
     names = sorted(
         {name for own in each for name in own}, key=lambda name: (SIDES.index(name.partition(".")[0]), name)

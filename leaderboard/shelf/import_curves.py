@@ -279,7 +279,6 @@ def _require_reachable(
 
 
 def _require_same_options(file: TaskFile, scale: Scale) -> None:
-    """Refuse options that contradict a task."""
     ranking, best = file.ranking, file.score.max_return
     unit = 1.0 if ranking.epsilons is None else best or scale.maximum or 1.0
     levels = sorted(unit * level for level in ranking.grid.thresholds)

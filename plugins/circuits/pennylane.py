@@ -189,7 +189,6 @@ class PennyLaneBackend:
         return max(1, self.lanes_per_pass() // (max(1, states) * B))
 
     def _build(self, device: Any) -> Any:
-        """Return the QNode of the circuit on a device."""
 
         def measure(angles: Tensor) -> list[Any]:
             rows = list(angles) if self.table.count else []
@@ -305,7 +304,6 @@ def _diff_method(options: PennyLaneOptions) -> str:
 
 
 def _device(options: PennyLaneOptions, qubits: int, seed: int | None) -> Any:
-    """Open a device by name."""
     seeded: dict[str, Any] = {} if seed is None else {"seed": seed}
     name = options.device
     if _on_braket(options):

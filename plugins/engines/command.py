@@ -54,7 +54,6 @@ PATIENCE = 60.0
 
 
 def _template(text: str) -> str:
-    """Check a template."""
     try:
         names = [name for _, name, _, _ in string.Formatter().parse(text) if name is not None]
     except ValueError as error:

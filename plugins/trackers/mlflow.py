@@ -122,7 +122,6 @@ def _without_sync(connection: Any, record: Any) -> None:
 
 
 def _experiment(client: MlflowClient, name: str) -> str:
-    """Return the id of an experiment, which is created where there is none."""
     if (found := client.get_experiment_by_name(name)) is None:
         try:
             return str(client.create_experiment(name))

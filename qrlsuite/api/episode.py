@@ -88,7 +88,6 @@ class Episode(Shown):
         )
 
     def __rich__(self) -> Text:
-        """Show the line."""
         return Text(str(self))
 
     def _repr_html_(self) -> str:

@@ -316,7 +316,6 @@ def _encoded(term: Encoding | int, inputs: torch.Tensor) -> torch.Tensor:
 
 
 def _make(spec: CircuitBackendSpec, circuit: Circuit, chosen: Any) -> CircuitBackend:
-    """Return the backend of a circuit."""
     from qrlsuite import specs
 
     factory = specs.resolve(spec.factory)
@@ -337,7 +336,6 @@ def _make(spec: CircuitBackendSpec, circuit: Circuit, chosen: Any) -> CircuitBac
 
 
 def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[CircuitBackendSpec, Any]:
-    """Return a backend that computes this kind of circuit, and its options."""
     from qrlsuite import options as option_values
     from qrlsuite import registry, specs
 
@@ -489,7 +487,6 @@ def expectations(
 
 
 def _dtype(inputs: Any, dtype: torch.dtype | str | None) -> torch.dtype:
-    """Return the precision to compute in."""
     import torch
 
     known = {"float32": torch.float32, "float64": torch.float64}

@@ -79,7 +79,6 @@ def _end_by_sigterm() -> None:
 
 
 def _load_plugins(paths: list[str]) -> None:
-    """Load plugins by path."""
     if not paths:
         return
     from qrlsuite.results import codes

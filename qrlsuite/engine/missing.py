@@ -308,6 +308,5 @@ def _newest_probe(work: Missing) -> str | None:
 
 
 def _warnings(store: EntryStore, group: SeedGroup) -> list[str]:
-    """Return the warnings of a group's worker."""
     left = ProgressFile(store, group.id).read().get("warnings")
     return [str(message) for message in left] if isinstance(left, list) else []

@@ -227,7 +227,6 @@ class _Run:
         return self._scores(scores), {**origin, "command": shlex.join(self.words)}
 
     def save(self, store: EntryStore, code: CodeIdentity, cpu: float) -> None:
-        """Store the seed."""
         scores, origin = self._curve()
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         made_with = [provenance.collect([]).content]

@@ -48,7 +48,6 @@ def task_file(name: str) -> str:
 
 
 def _source(environment: str) -> str:
-    """Return the distribution of a registered environment."""
     return registry.load().get(specs.EnvironmentSpec, environment).distribution
 
 

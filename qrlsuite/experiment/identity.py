@@ -286,7 +286,6 @@ def _files(entry: Entry) -> Iterator[Part]:
 
 
 def _content(path: Path) -> str | None:
-    """Return the SHA-256 of a file, None where there is none."""
     try:
         if not path.is_file():
             return None

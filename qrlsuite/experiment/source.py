@@ -176,7 +176,6 @@ def reached(
 
 
 def _content(spec: ModuleSpec) -> bytes | None:
-    """Return the bytes of a module's file; None where it has none."""
     if not spec.has_location or spec.origin is None:
         return None
     try:

@@ -650,7 +650,6 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _environment_problems(section: Any) -> list[str]:
-    """Return problems of the environment in a file with problems elsewhere."""
     try:
         parsed = EnvironmentSection.model_validate(section)
     except pydantic.ValidationError:

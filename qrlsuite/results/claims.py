@@ -247,7 +247,6 @@ def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
 
 
 def _write(store: EntryStore, seeds: Sequence[int]) -> Claim:
-    """Write a claim of seeds."""
     token = secrets.token_hex(8)
     claim = Claim(
         path=store.claims / f"{token}.json",

@@ -85,7 +85,6 @@ def _footer(content: bytes) -> Mapping[int, Any]:
 
 
 def _structures(fields: Mapping[int, Any], field: int) -> list[dict[int, Any]]:
-    """Return a list of structures, empty where it is absent."""
     found = fields.get(field, [])
     if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
         raise _Damaged("its footer has other parts than a footer")

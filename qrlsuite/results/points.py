@@ -102,7 +102,6 @@ class _Rows:
         self._count = 0
 
     def add(self, entry: str, seed: int, step: int, score: float, source: str, metric: str = "") -> None:
-        """Add a point."""
         if not math.isfinite(score):
             raise FileError(
                 f"{source}: the score of '{ascii(entry)[1:-1]}', seed {seed}, at step {step} is {score}: every score "
@@ -323,7 +322,6 @@ def _column(column: str, names: Sequence[str], but: Sequence[str] = ()) -> list[
 def _columns(
     names: Sequence[str], metric: str | None, source: str, wanted: Sequence[str] = COLUMNS
 ) -> list[str]:
-    """Return the names of the wanted columns."""
     found: dict[str, str] = {}
     wrong, several = list[str](), list[str]()
     for column in (column for column in NAMES if column in wanted):
@@ -357,7 +355,6 @@ def _measure(columns: Sequence[str]) -> str:
 
 
 def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str, metric: str) -> None:
-    """Add a row of four values."""
     for name, value in zip(COLUMNS, values):
         if value is None or value == "":
             raise FileError(
@@ -391,7 +388,6 @@ def _by_words(paths: Sequence[Path]) -> dict[tuple[str, ...], list[Path]]:
 
 
 def _named(of_folders: Mapping[tuple[str, ...], list[Path]]) -> dict[Run, list[Path]]:
-    """Return files by the run that they are of."""
     words_of: dict[tuple[str, ...], tuple[list[str], int]] = {}
     for key, files in of_folders.items():
         *above, run = key

@@ -218,7 +218,6 @@ def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
 
 
 def _evaluations(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
-    """Return the mean return of the episodes of each evaluation."""
     path = paths[0]
     steps, results = (_npz_array(path, name) for name in ("timesteps", "results"))
     if steps.ndim != 1 or results.ndim != 2 or len(results) != len(steps) or not results.shape[1]:

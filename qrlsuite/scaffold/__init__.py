@@ -201,7 +201,6 @@ def _register(tree: ast.Module) -> Iterator[tuple[int, int, str]]:
 
 
 def _registration(registered: Sequence[specs.Spec], module: str, inner: str) -> str:
-    """Return a module of hooks that register specs."""
     pieces = [
         '"""What qrlsuite loads at every start: register here, import nothing heavy."""\n\n'
         "from __future__ import annotations\n\nfrom collections.abc import Callable\n\n"

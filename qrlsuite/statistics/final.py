@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qrlsuite.errors import OptionError
-from qrlsuite.statistics.across import across_tasks
+from qrlsuite.statistics.across import AcrossTasks, across_tasks
 from qrlsuite.statistics.curves import LearningCurves
-from qrlsuite.statistics.grid import FloatArray, Grid, IntArray
+from qrlsuite.statistics.grid import FloatArray, Grid
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
 
 
@@ -54,40 +54,18 @@ def deviations(entry: LearningCurves, grid: Grid) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ScoreBoard:
-    """The result of `compare_scores` for M entries; matrices are from the row's side, in units of the score.
+class ScoreBoard(AcrossTasks):
+    """The result of `compare_scores` for M entries: as for several tasks, but that more is better.
 
     Attributes
     ----------
-    names:
-        The entries in the order given.
-    mean, interquartile_mean:
-        Shape (M,): over runs; the mean of the middle half of them.
-    mean_interval, interquartile_interval:
-        Shape (M, 2): percentiles of the bootstrap, at level 1 - alpha for each entry by itself.
     difference, difference_interval:
-        Shape (M, M) and (M, M, 2): mean of the row's entry minus mean of the column's; Welch's t at level 1 - alpha for
-        each pair by itself.
-    improvement:
-        Shape (M, M): probability that a run of the row's entry scores more than one of the column's; ties count half.
-    p, adjusted:
-        Shape (M, M): of the permutation test of each pair (studentized difference of means); adjusted for all pairs
-        (Holm). NaN on the diagonal.
-    better:
-        Shape (M, M): +1 where the row's entry scores significantly more, -1 where less, else 0.
+        Shape (M, M) and (M, M, 2): mean of the row's entry minus mean of the column's, in units of the score; Welch's t
+        at level 1 - alpha for each pair by itself.
     """
 
-    names: tuple[str, ...]
-    mean: FloatArray
-    interquartile_mean: FloatArray
-    mean_interval: FloatArray = field(repr=False)
-    interquartile_interval: FloatArray = field(repr=False)
     difference: FloatArray = field(repr=False)
     difference_interval: FloatArray = field(repr=False)
-    improvement: FloatArray = field(repr=False)
-    p: FloatArray = field(repr=False)
-    adjusted: FloatArray = field(repr=False)
-    better: IntArray = field(repr=False)
 
     @property
     def order(self) -> tuple[int, ...]:

@@ -68,7 +68,6 @@ def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, N
 
 
 def _feature(term: int | Encoding | None, inputs: NDArray[np.float64]) -> float:
-    """Return an input, a function of inputs, or 1 for None."""
     if not isinstance(term, Encoding):
         return 1.0 if term is None else float(inputs[term])
     values = [_angle(each, inputs, {}) for each in term.of]

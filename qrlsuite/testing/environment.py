@@ -167,7 +167,6 @@ def _shapes(lanes: Lanes) -> None:
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type) -> None:
-    """Require an array of a shape and a type, and numbers in it."""
     require(isinstance(value, np.ndarray), f"{name} are {type(value).__name__}, and must be a numpy array")
     require(
         value.shape == shape,

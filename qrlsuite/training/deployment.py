@@ -106,7 +106,6 @@ class Cost:
     terms: str = ""
 
     def __str__(self) -> str:
-        """Say it in a line."""
         shots = (
             "" if self.shots is None else f", {self.shots} shots each: {self.shots * self.circuits:,} shots"
         )

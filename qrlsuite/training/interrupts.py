@@ -25,7 +25,6 @@ class Interruptible:
         self._old: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Interruptible:
-        """Install the handlers."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._old[number] = signal.signal(number, self._handle)

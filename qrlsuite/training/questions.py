@@ -108,7 +108,6 @@ class _Lanes:
         self.episodes: list[list[bytes]] = [[] for _ in self.running]
 
     def step(self) -> None:
-        """Take a step in every lane."""
         if self.steps.max() == len(self.actions):
             self.actions.append(actions.draw(self.envs.single_action_space, self.source, 1)[0])
         with seeded(self.state):
@@ -128,7 +127,6 @@ class _Lanes:
         self.steps = np.where(done, 0, self.steps + 1)
 
     def shown(self) -> list[tuple[bytes, ...]]:
-        """Return digests of everything that each lane has shown."""
         return [(*ended, now.digest()) for ended, now in zip(self.episodes, self.running)]
 
     def changes(self, lane: int) -> int:

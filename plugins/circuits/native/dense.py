@@ -207,7 +207,6 @@ def _begin(component: Component, angles: Tensor) -> Tensor:
 def _apply(
     program: Program, qubits: int, state: Tensor, step: list[int], angles: Tensor, inverse: bool = False
 ) -> None:
-    """Apply a step, or its inverse, in place."""
     kind = step[0]
     if kind == ROTATE:
         a, b, phase = _block(program, step[3], angles)

@@ -107,7 +107,6 @@ class PauliNoise:
 
 
 def _anticommute(rotation: str, x: Bits, z: Bits) -> Bits:
-    """Return 1 where the error X^x Z^z anticommutes with the axis of a rotation."""
     return {"RX": z, "RY": x ^ z, "RZ": x}[rotation]
 
 

@@ -405,7 +405,6 @@ def _observables(job: Job) -> Observables | None:
 
 
 def _word(word: Any, coefficient: Any, number: int, measurement: Any) -> Word:
-    """Return a term of an observable."""
     exact = complex(qml.math.unwrap([coefficient])[0])
     if abs(exact.imag) > 1e-12 * max(1.0, abs(exact)):
         raise DeviceError(

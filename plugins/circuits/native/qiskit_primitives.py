@@ -354,7 +354,6 @@ def _angle(value: Any, known: dict[Any, NDArray[np.float64]]) -> Any:
 
 
 def _means(pub: Any, plan: Plan) -> NDArray[np.float64]:
-    """Return the means of a pub, in its shape."""
     shape = pub.shape
     given = pub.observables.ravel()
     sums = [_words(given[(i,)], plan.wires) for i in range(given.size)]

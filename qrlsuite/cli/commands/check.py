@@ -81,7 +81,6 @@ def check(
 
 
 def _options_in(task: str, item: CheckTarget) -> dict[str, Any]:
-    """Return the options that a task gives the environment which is to be checked."""
     section = load_task(task).file.environment
     if section.name != item.name:
         raise typer.BadParameter(f"--task {task}: its environment is '{section.name}', not '{item.name}'")

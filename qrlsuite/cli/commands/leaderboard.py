@@ -177,7 +177,6 @@ def _nothing(runs: Path, tasks: Sequence[str]) -> UnknownNameError:
 
 
 def _text(board: Leaderboard, explain: bool, format_: Format) -> str:
-    """Return tables as the text of a file."""
     match format_:
         case "json":
             return json.dumps(board.as_dict()) + "\n"
