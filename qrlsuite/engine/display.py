@@ -279,6 +279,10 @@ class RunDisplay:
         self._last_line = time.monotonic()
         self._last: dict[str, dict[str, Any]] = {}
 
+    def _say(self, text: str) -> None:
+        """Print a sentence as it is, on one line."""
+        self.console.print(text, markup=False, soft_wrap=True)
+
     def begin(self, submits: bool = False, holders: Sequence[str] = ()) -> None:
         """Print the plan, for training here or for submitted tasks.
 
@@ -293,11 +297,9 @@ class RunDisplay:
             f"({escape(str(self.missing.store.path))})"
         )
         if self.new_folder:
-            self.console.print(
+            self._say(
                 f"results go to the new folder {self.missing.runs.absolute()}; "
-                f"{'--runs or QRLSUITE_RUNS' if self.again == 'command' else '`runs`'} names another",
-                markup=False,
-                soft_wrap=True,
+                f"{'--runs or QRLSUITE_RUNS' if self.again == 'command' else '`runs`'} names another"
             )
         todo = sum(len(group.seeds) for group in self.groups)
         if busy:
@@ -305,11 +307,9 @@ class RunDisplay:
             waits = "waits in the queue or is" if len(busy) == 1 else "wait in the queue or are"
             who = f" by {', '.join(holders)}" if holders else ""
             nothing = "" if todo else ": nothing is left to do here"
-            self.console.print(
+            self._say(
                 f"{counted(len(busy), 'seed')} {waits if submits else are} being trained{who}{nothing}; repeat this "
-                f"{self.again} when that has ended to see the whole",
-                markup=False,
-                soft_wrap=True,
+                f"{self.again} when that has ended to see the whole"
             )
         if not todo:
             return
@@ -330,7 +330,7 @@ class RunDisplay:
         if model.faster in registry.load().names(specs.ModelSpec):
             notes.append(f"faster: --model {model.faster} computes the same, {model.speedup}")
         for line in [*notes, *filter(None, [self.expected])]:
-            self.console.print(line, markup=False, soft_wrap=True)
+            self._say(line)
         if submits:
             return
         self.bar.start(todo * self.epochs, "starting")
@@ -341,7 +341,7 @@ class RunDisplay:
         self._last = snapshot
         if not self.probing and any(state.get("phase") == "probing" for state in snapshot.values()):
             self.probing = True
-            self.console.print(PROBING, markup=False, soft_wrap=True)
+            self._say(PROBING)
         left = self.estimate.remaining(snapshot, now)
         if left is not None:
             self._announce(left)
@@ -391,14 +391,13 @@ class RunDisplay:
                 if settled
                 else "{} or more left, by the first rounds"
             )
-            self.console.print(by.format(duration(left)), soft_wrap=True)
+            self._say(by.format(duration(left)))
         self._announced = True
         if settled and not self._advised:
             self._advised, self.endless = True, left > DAY
             if left > 3600:
-                self.console.print(
-                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; all that is trained counts",
-                    soft_wrap=True,
+                self._say(
+                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; all that is trained counts"
                 )
 
     def close(self) -> None:
@@ -408,17 +407,16 @@ class RunDisplay:
     def interrupted(self) -> None:
         """Say that everything is safe."""
         self.close()
-        self.console.print(f"stopped; {self._goes_on}.")
+        self._say(f"stopped; {self._goes_on}.")
 
     def out_of_time(self, budget: str) -> None:
         """Print that the budget has ended, the epochs so far, and the command that continues."""
         self.close()
         epochs = _range([int(state.get("epoch") or 0) for state in self._last.values()] or [0])
         limit = "--budget" if self.again == "command" else "`budget`"
-        self.console.print(
+        self._say(
             f"stopped after {budget}, at epoch {epochs} of {self.epochs}; {self._goes_on}, and without {limit} to the "
-            "end.",
-            soft_wrap=True,
+            "end."
         )
 
     @property
@@ -432,7 +430,7 @@ class RunDisplay:
         """Print a summary, the groups that others train, and the next command."""
         self.close()
         for group in at_work:
-            self.console.print(printable(group.text), markup=False, soft_wrap=True)
+            self._say(printable(group.text))
         if at_work and not summary["seeds"]:
             return
         score = summary["median_score"]
@@ -442,29 +440,25 @@ class RunDisplay:
         )
         self.console.print(f"{counted(summary['seeds'], 'seed')} complete{score_text}")
         if summary["threshold_reached"] is False:
-            self.console.print(
+            self._say(
                 f"no seed reached a threshold: the {'lowest' if goal == 'above' else 'highest'} is "
                 f"{summary['lowest_threshold']:.4g}, the best {ranked} seen {summary['best_score']:.4g}. Entries that "
                 "reach none are not told apart by steps: train longer (--epochs), rank 20 seeds or more by learning "
                 f"curves alone (leaderboard --by area), or {'lower' if goal == 'above' else 'raise'} the thresholds "
-                "([ranking] in the task file) before the next entry is trained",
-                markup=False,
-                soft_wrap=True,
+                "([ranking] in the task file) before the next entry is trained"
             )
         if summary["diverged"]:
-            self.console.print(
+            self._say(
                 f"{summary['diverged']} of them diverged: numbers of their agents are no longer finite. They stay in "
-                "the results with the scores that they had; a smaller learning rate is the usual cure",
-                soft_wrap=True,
+                "the results with the scores that they had; a smaller learning rate is the usual cure"
             )
         protocol_seeds = self.entry.task.file.protocol.seeds
         if summary["seeds"] < protocol_seeds:
             self.console.print(f"provisional: the task's protocol asks for {protocol_seeds} seeds")
-        self.console.print(f"results: {self.missing.store.path}", markup=False, soft_wrap=True)
+        self._say(f"results: {self.missing.store.path}")
         if min(self.missing.seeds) >= TUNING_SEEDS:
-            self.console.print(
-                f"seeds from {TUNING_SEEDS:,} up are for trying settings: boards and pictures leave them out",
-                soft_wrap=True,
+            self._say(
+                f"seeds from {TUNING_SEEDS:,} up are for trying settings: boards and pictures leave them out"
             )
             return
         if not summary["seeds"] and not any(state.get("epoch") for state in self._last.values()):
@@ -474,14 +468,10 @@ class RunDisplay:
         others = [each.name for each in stored if each.key[1] not in ("", self.entry.task.hash)]
         if others:
             delete = command("runs", "rm", f"{name}/{others[0]}", runs=self.missing.runs)
-            self.console.print(
+            self._say(
                 f"{counted(len(others), 'entry')} of another definition of task '{name}' here: {listed(others, 3)}. "
                 "Boards rank the definition with the most entries (--task FILE.toml: that of the file), pictures need "
-                f"a single one. To delete: {delete}",
-                markup=False,
-                soft_wrap=True,
+                f"a single one. To delete: {delete}"
             )
         for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
-            self.console.print(
-                f"next: {command(*arguments, runs=self.missing.runs)}", markup=False, soft_wrap=True
-            )
+            self._say(f"next: {command(*arguments, runs=self.missing.runs)}")
