@@ -511,13 +511,7 @@ def diagnose(
 
 
 def numbers(name: str, given: str | int | Sequence[int]) -> list[int]:
-    """Read numbers: 4, [4, 6], or text such as `4:12` (both included), `2:16:2` or `4,6,10`.
-
-    Raises
-    ------
-    OptionError
-        Saying how they are written.
-    """
+    """Read numbers: 4, [4, 6], or text such as `4:12` (both included), `2:16:2` or `4,6,10`."""
     text = (
         given if isinstance(given, str) else ",".join(map(str, [given] if isinstance(given, int) else given))
     )

@@ -140,13 +140,7 @@ class Episode(Shown):
 
 
 def check_ending(file: Path) -> None:
-    """Refuse a file that no animation can be written to, before anything is played.
-
-    Raises
-    ------
-    OptionError
-        Names the possible endings, or the package to install.
-    """
+    """Refuse a file that no animation can be written to, before anything is played."""
     if file.suffix not in ENDINGS:
         raise OptionError(f"--out {file}: the file's ending must be {' or '.join(ENDINGS)}")
     if file.suffix == ".mp4":

@@ -237,15 +237,7 @@ def evaluate(
 
 
 def find_players(written: Selection, names: Iterable[str]) -> tuple[Task | None, list[EntryStore]]:
-    """Return the task that is played, None where entries play their own; and where their trained agents are.
-
-    Raises
-    ------
-    UnknownNameError
-        If the task is unknown, or none or several entries have a name.
-    StoreError
-        If an entry is published, and without agents.
-    """
+    """Return the task that is played, None where entries play their own; and where their trained agents are."""
     on = _task(written) if written.tasks else None
     selection = written if on is None else written.of(on.name)
     found = (find(selection, name) for name in names)
@@ -268,13 +260,6 @@ def find(selection: Selection, name: str) -> EntryStore:
     """Return where the trained agents of an entry are; of copies that have some, the better one.
 
     The selection's task is looked into, unless the name says which one: `TASK/NAME`, or a folder.
-
-    Raises
-    ------
-    UnknownNameError
-        If none or several match.
-    StoreError
-        If it is published, and without agents.
     """
     before, slash, _ = name.partition("/")
     placed = (Path(name) / "entry.json").exists() or (slash and "=" not in before)

@@ -85,11 +85,6 @@ def export(
         Replace entries with more seeds or epochs.
     agents:
         Whether to write the trained agents, too.
-
-    Raises
-    ------
-    QrlSuiteError
-        If a name is unknown, an entry that is named cannot be written, or nothing is complete.
     """
     everything, names = list(names) == [ALL], list(dict.fromkeys(names))
     if not names:
@@ -134,13 +129,7 @@ def _is_study(name: str) -> bool:
 
 
 def export_rliable(file: Path, tasks: Sequence[str], names: Sequence[str], runs: Path) -> Shares:
-    """Write the scores of entries over several tasks to a .npz file, as arrays that rliable reads.
-
-    Raises
-    ------
-    OptionError
-        If fewer than two tasks are named.
-    """
+    """Write the scores of entries over several tasks to a .npz file, as arrays that rliable reads."""
     if len(tasks) < 2:
         raise OptionError(f"--out {file}: name two tasks or more, as --task A --task B")
     selection = Selection.create(runs, tasks).named()
@@ -176,11 +165,6 @@ def find_published(paths: Sequence[Path], base: str | None) -> ToVerify:
         Entries, or folders of entries; empty for the suite's.
     base:
         A git commit; None looks at `paths`.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there are none, or both are given.
     """
     if base is not None and paths:
         raise OptionError("give PATH or --base, not both")
@@ -192,13 +176,7 @@ def find_published(paths: Sequence[Path], base: str | None) -> ToVerify:
 
 
 def read_rerun(text: str) -> tuple[checks.Wanted, int | None]:
-    """Read how many seeds are trained again, and the number that chose them: `26`, `auto`, `2 choice=31`.
-
-    Raises
-    ------
-    OptionError
-        If it is neither a whole number nor `auto`, or has other options.
-    """
+    """Read how many seeds are trained again, and the number that chose them: `26`, `auto`, `2 choice=31`."""
     wanted, options = parse_named(text, "--rerun ")
     choice = options.pop("choice", None)
     if options or not (wanted == "auto" or wanted.isdecimal()):

@@ -67,13 +67,6 @@ def describe(
     -------
     dict or Overview or State or StudiesTogether
         For a study the result of `read_study`.
-
-    Raises
-    ------
-    UnknownNameError
-        If nothing or several things have the name.
-    OptionError
-        If settings, a file or a format are given that the thing cannot have.
     """
     folder = Path(runs)
     of_ansatz = bool(settings or out or format)
@@ -153,26 +146,14 @@ def _ansatz(
 
 
 def _code_of_plugin(kind: type[specs.Spec], name: str) -> dict[str, Any]:
-    """Return a registered thing's part of an entry's identity: its files or `numerics`.
-
-    Raises
-    ------
-    OptionError
-        If it computes nothing of an entry.
-    """
+    """Return a registered thing's part of an entry's identity: its files or `numerics`."""
     if not issubclass(kind, specs.NumericSpec):
         raise OptionError(f"{specs.title(kind, name)} computes nothing of an entry, and has no code identity")
     return dict(identity.of_registered(kind, name, None))
 
 
 def _stored(selection: Selection, name: str) -> EntryStore | None:
-    """Find an entry by its folder, or by its name in the results folder; None if nothing fits.
-
-    Raises
-    ------
-    UnknownNameError
-        If several fit, or no published entry does.
-    """
+    """Find an entry by its folder, or by its name in the results folder; None if nothing fits."""
     if (Path(name) / "entry.json").exists():
         return EntryStore(Path(name))
     if selection.published:

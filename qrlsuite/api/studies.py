@@ -256,11 +256,6 @@ def find_studies(
     -------
     tuple
         The studies with a wanted entry, the study that lacks least first; and one line for each other one of `all`.
-
-    Raises
-    ------
-    QrlSuiteError
-        If there is no such study or entry, or one of all studies is broken by itself.
     """
     changes = from_mapping(options)
     found, refusals = list[Overview](), list[OptionError]()
@@ -280,15 +275,7 @@ def find_studies(
 def train_studies(
     every: Sequence[Overview], where: Where, budget: str | None, progress: bool
 ) -> Iterator[Overview]:
-    """Train study after study until the budget ends; yield what each has and lacks then.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        When it was interrupted and every worker has saved and ended.
-    QrlSuiteError
-        If training failed; finished epochs are kept.
-    """
+    """Train study after study until the budget ends; yield what each has and lacks then."""
     console = Console(stderr=True, quiet=not progress, highlight=False, soft_wrap=True, markup=False)
     missing.check_budget(budget, where)
     began = time.monotonic()

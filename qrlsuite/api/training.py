@@ -132,15 +132,7 @@ def resolve_entry(
     preset: str | None = None,
     runs: str | PathLike[str] = "runs",
 ) -> Entry:
-    """Return the entry that is to be trained.
-
-    Raises
-    ------
-    UnknownNameError
-        For an unknown name; the message says where the results folder has a copy of its plugin.
-    OptionError, FileError
-        For an option or a file that cannot be used.
-    """
+    """Return the entry that is to be trained."""
     try:
         entry = resolve(task, model, algorithm, settings, preset)
         return entry if entry.script is None else replace(entry, folder=Path.cwd())

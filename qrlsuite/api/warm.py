@@ -31,15 +31,6 @@ def begin_with(
         The entry of the agents: one of the same task, `TASK/ENTRY`, or a folder; of the results folder, or published.
     seeds:
         The seeds to train; None takes the task's protocol. Existing agents stay.
-
-    Raises
-    ------
-    UnknownNameError
-        If no entry, or several, have the name.
-    StoreError
-        If it has no agents, or they have other parameters than the model.
-    OptionError
-        If the algorithm cannot begin with agents.
     """
     source = find(Selection(runs, True, (entry.task.name,)), name)
     agents, _, _ = evaluation.best_runs(source, max(1, len(source.seeds())))

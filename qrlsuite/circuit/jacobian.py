@@ -39,11 +39,6 @@ def jacobians(
     -------
     array
         (N, O, P).
-
-    Raises
-    ------
-    OptionError
-        If the circuit is too large, or a number is not finite.
     """
     import torch
 

@@ -26,12 +26,6 @@ def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") 
         Whether scores are fractions of a known maximum, in [0, 1].
     name:
         Name of the curves in an error message.
-
-    Raises
-    ------
-    OptionError
-        If there is no run or no epoch, the shape is not (N, T), a value is not a number, or a relative score
-        lies outside [0, 1].
     """
     try:
         values = np.asarray(curves)
