@@ -68,6 +68,9 @@ class Algorithm(Protocol):
         episode is a state of its own, forgotten where an episode begins. The memory of training is a separate state,
         in `state_dict`; neither is in `policy_state`.
 
+        An algorithm may have a method `choose(seen)`, which returns greedy actions (S, B) for a tensor (S, B, obs)
+        without a host read: by it, validation is played on the device (`qrlsuite.device`).
+
         An algorithm whose network makes a policy may have a method `information(outputs)`: for outputs (S, B, outputs)
         float64 of the first network that it built, the Fisher information (S, B, outputs, outputs) of the actions'
         distribution. Without it, `qrlsuite diagnose` takes outputs for values.

@@ -6,7 +6,7 @@ Lanes are seed-major: with S seeds and E environments each, lane = s * E + e.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from qrlsuite.actions import check_actions
 from qrlsuite.errors import OptionError, StoreError
+
+if TYPE_CHECKING:
+    from qrlsuite.device import DeviceLanes
 
 State = dict[str, NDArray[Any]]
 """A checkpointed state: arrays whose first axis is the lane, without random streams (the core keeps those)."""
@@ -44,6 +47,8 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     """False in validation: an ended lane need not be reset; stepping it on is allowed and means nothing."""
     running_statistics: bool = False
     """True: agents standardize this environment's observations, see `qrlsuite.training.standardization`."""
+    on_device: DeviceLanes | None = None
+    """The same lanes as torch operations, where an algorithm may play its epochs by them; None: by `step` alone."""
     unflattened_space: gymnasium.Space[Any] | None = None
     """The space of observations before lanes flattened them, an image or a Dict; None: `single_observation_space`."""
 

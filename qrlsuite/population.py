@@ -23,6 +23,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
+from qrlsuite.device import upload
 from qrlsuite.errors import PluginError
 from qrlsuite.options import Since, per_agent
 
@@ -567,8 +568,8 @@ class Adam:
         self.mean = {name: torch.zeros_like(p) for name, p in self._named}
         self.square = {name: torch.zeros_like(p) for name, p in self._named}
         self._blocks: tuple[Any, ...] | None = None
-        self._on_device: dict[str, tuple[float | Tensor, Tensor]] = {}
-        """Learning rates by name, as they are in `rates` and on the device."""
+        self._uploaded: dict[str, float | Tensor] = {}
+        self._on_device: dict[str, Tensor] = {}
 
     def decay(self, interactions: int, decay_steps: int | None) -> None:
         """Set the learning rates to what is left of the first ones after so many of `decay_steps` interactions."""
@@ -623,13 +624,10 @@ class Adam:
         rate = self.rates[name]
         if self.steps.is_cpu:
             return rate
-        if name not in self._on_device:
-            self._on_device[name] = rate, torch.as_tensor(rate, dtype=torch.float64).to(self.steps.device)
-        before, there = self._on_device[name]
-        if before is not rate:
-            there.copy_(torch.as_tensor(rate))
-            self._on_device[name] = rate, there
-        return there
+        if self._uploaded.get(name) is not rate:
+            self._uploaded[name] = rate
+            upload(self._on_device, self.steps.device, **{name: torch.as_tensor(rate, dtype=torch.float64)})
+        return self._on_device[name]
 
     def _move(self, active: Tensor | None) -> bool:
         """Make the step in one compiled pass, for which parameters come to lie in one block; False if torch has to."""

@@ -29,26 +29,24 @@ class Replay:
     ----------
     rows:
         (S, capacity, numbers) float32; 0 where nothing was stored yet.
+    count:
+        `stored` on a device, where rounds read it; None on the CPU.
+    stored:
+        Rows ever stored, per seed.
     """
 
     def __init__(self, seeds: int, capacity: int, device: torch.device, **columns: int) -> None:
         self.columns = columns
         self.rows = torch.zeros((seeds, capacity, sum(columns.values())), device=device)
-        self._stored = 0
-        self._count = None if self.rows.is_cpu else torch.zeros((), dtype=torch.int64, device=device)
-        """`stored` on the device, where rounds read it."""
+        self.stored = 0
+        self.count = None if self.rows.is_cpu else torch.zeros((), dtype=torch.int64, device=device)
         self._borders = np.array([0, *itertools.accumulate(columns.values())])
 
-    @property
-    def stored(self) -> int:
-        """Rows ever stored, per seed."""
-        return self._stored
-
-    @stored.setter
-    def stored(self, rows: int) -> None:
-        self._stored = rows
-        if self._count is not None:
-            self._count.fill_(rows)
+    def resume(self, stored: int) -> None:
+        """Go on after so many rows."""
+        self.stored = stored
+        if self.count is not None:
+            self.count.fill_(stored)
 
     @property
     def filled(self) -> int:
@@ -60,7 +58,7 @@ class Replay:
         (seeds, capacity, _), widths = self.rows.shape, self.columns.values()
         given = [values[name] for name in self.columns]
         new = math.prod(given[0].shape) // seeds // int(self._borders[1])
-        place = self._stored % capacity
+        place = self.stored % capacity
         if place + new <= capacity and self.rows.is_cpu:
             held = self.rows.numpy()[:, place : place + new]
             for each, width, first in zip(given, widths, self._borders):
@@ -74,11 +72,11 @@ class Replay:
                 ],
                 2,
             )
-            start: int | Tensor = self._stored if self._count is None else self._count
+            start: int | Tensor = self.stored if self.count is None else self.count
             self.rows[:, (start + torch.arange(new, device=self.rows.device)) % capacity] = both
-        self._stored += new
-        if self._count is not None:
-            self._count += new
+        self.stored += new
+        if self.count is not None:
+            self.count += new
 
     def batch(self, draws: Tensor) -> dict[str, Tensor]:
         """Return rows of every seed, each quantity (S, B, numbers), contiguous.
@@ -88,7 +86,7 @@ class Replay:
         draws:
             (S, B) float64, uniform in [0, 1): they choose stored rows, with replacement.
         """
-        filled = self.filled if self._count is None else self._count.clamp(max=self.rows.shape[1])
+        filled = self.filled if self.count is None else self.count.clamp(max=self.rows.shape[1])
         return self.at((draws * filled).to(torch.int64))
 
     def at(self, places: Tensor) -> dict[str, Tensor]:
@@ -124,4 +122,4 @@ class Replay:
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore a result of `state_dict`."""
         self.rows.copy_(state["rows"])
-        self.stored = int(state["stored"][0])
+        self.resume(int(state["stored"][0]))

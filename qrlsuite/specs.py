@@ -129,6 +129,9 @@ class EnvironmentSpec(NumericSpec):
     vector:
         Reference to `factory(options, num_envs) -> qrlsuite.environment.LaneEnv`; None uses a generic one
         over `gymnasium.make`.
+    device:
+        Reference to `factory(lanes, device) -> qrlsuite.device.DeviceLanes`, which plays the lanes that `vector` made
+        by torch operations on a device; None: steps are NumPy's.
     policies:
         Reference policies for `qrlsuite evaluate`, by name: each a reference to `factory(envs) -> policy`,
         called when all lanes of the `LaneEnv` have been reset, and `policy(observations) -> actions` maps
@@ -149,6 +152,7 @@ class EnvironmentSpec(NumericSpec):
     gymnasium_id: str
     entry_point: str | None = None
     vector: str | None = None
+    device: str | None = None
     policies: dict[str, str] = field(default_factory=dict)
     pictures: tuple[PictureSpec, ...] = ()
     views: tuple[str, ...] = ()

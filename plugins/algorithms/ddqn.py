@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from torch import Tensor
 
 from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel
+from qrlsuite.device import Ahead, Captured, DeviceLanes, upload
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
 from qrlsuite.population import Adam, DecaySteps, by_seed, chosen_errors, part, prefixed, renew, sweeps
@@ -106,6 +107,10 @@ class DDQN:
         self.epsilon = np.broadcast_to(np.asarray(options.epsilon), self.S)
         self.target_steps = torch.as_tensor(options.target_steps).long().expand(self.S).to(device)
         self.epoch = 0
+        self._numbers = Ahead(self._epoch_numbers)
+        self._drawn: dict[str, Tensor] = {}
+        """On the device: an epoch's numbers, and its errors."""
+        self._captured = Captured(self._round, self._changed, self.online)
         self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
 
     def _hold(self, observations: Tensor) -> None:
@@ -123,34 +128,77 @@ class DDQN:
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
-        errors = torch.empty((rounds, self.S, self.options.batch), device=self.device)
         self.adam.decay(self.epoch * rounds * self.E, self.options.decay_steps)
-        for k, (explore, action, draws, found) in enumerate(zip(*self._epoch_numbers(rounds), errors)):
-            greedy = self._greedy(self.observations)
-            uniform = masks.drawn(action, self.observations, self.obs_dim, self.streams, self.epoch, k)
-            self._interact(torch.where(explore, uniform, greedy))  # (S, E)
-            found.copy_(self._learn(draws))
+        if self.envs.on_device is not None:
+            errors = self._epoch_on_device(self.envs.on_device, rounds)
+        else:
+            errors = torch.empty((rounds, self.S, self.options.batch), device=self.device)
+            numbers = (each.to(self.device) for each in self._epoch_numbers(rounds, self.epoch))
+            for k, (explore, action, draws, found) in enumerate(zip(*numbers, errors)):
+                greedy = self.choose(self.observations)
+                uniform = masks.drawn(action, self.observations, self.obs_dim, self.streams, self.epoch, k)
+                self._interact(torch.where(explore, uniform, greedy))  # (S, E)
+                found.copy_(self._learn(draws))
         self.epoch += 1
         losses = errors.square().mean(2).cpu().double().cumsum(0)[-1]  # in the order of rounds
         return {"loss": (losses / rounds).numpy(), **self.adam.gradient_norms()}
 
-    def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _epoch_numbers(self, rounds: int, epoch: int) -> tuple[Tensor, Tensor, Tensor]:
         """Draw an epoch's exploration (rounds, S, E), twice, and replay positions (rounds, S, batch) in [0, 1)."""
         explore = np.empty((rounds, self.S, self.E), dtype=bool)
         action = np.empty((rounds, self.S, self.E), dtype=np.int64)
         draws = np.empty((rounds, self.S, self.options.batch))
         epsilon = np.broadcast_to(self.epsilon, (rounds, self.S))
         if self.options.epsilon_steps is not None:
-            interactions = (self.epoch * rounds + np.arange(rounds)[:, None]) * self.E
+            interactions = (epoch * rounds + np.arange(rounds)[:, None]) * self.E
             epsilon = epsilon + (1.0 - epsilon) * np.maximum(
                 0.0, 1.0 - interactions / self.options.epsilon_steps
             )
         for s, streams in enumerate(self.streams):
-            exploration = streams.numpy("exploration", self.epoch)
+            exploration = streams.numpy("exploration", epoch)
             explore[:, s] = exploration.random((rounds, self.E)) < epsilon[:, s, None]
             action[:, s] = exploration.integers(self.actions, size=(rounds, self.E))
-            draws[:, s] = streams.numpy("replay", self.epoch).random((rounds, self.options.batch))
-        return tuple(torch.from_numpy(a).to(self.device) for a in (explore, action, draws))  # type: ignore[return-value]
+            draws[:, s] = streams.numpy("replay", epoch).random((rounds, self.options.batch))
+        return torch.from_numpy(explore), torch.from_numpy(action), torch.from_numpy(draws)
+
+    def _epoch_on_device(self, lanes: DeviceLanes, rounds: int) -> Tensor:
+        """Interact and learn for `rounds` rounds without a host read; returns Q(s, a) - y (rounds, S, batch)."""
+        explore, action, draws = self._numbers(rounds, self.epoch)
+        self._numbers.begin(rounds, self.epoch + 1)
+        errors = torch.empty(draws.shape, device=self.device)
+        upload(self._drawn, self.device, explore=explore, action=action, draws=draws, errors=errors)
+        lanes.begin(rounds)
+        stored = self.replay.stored
+        self._captured(rounds)
+        self.replay.resume(stored + rounds * self.E)
+        for chosen in lanes.actions():
+            self.envs.step(chosen)
+        return self._drawn["errors"]
+
+    def _round(self) -> None:
+        """One round on the device: every environment takes a step, and every agent learns."""
+        lanes = cast("DeviceLanes", self.envs.on_device)
+        k = lanes.state["round"].clone()
+        explore, action, draws = (
+            self._drawn[n].index_select(0, k)[0] for n in ("explore", "action", "draws")
+        )
+        chosen = torch.where(explore, action, self.choose(self.observations))
+        arrived, reward, terminated = lanes.step(chosen.view(-1))
+        self.replay.add(
+            seen=self.observations,
+            after=arrived.view(self.observations.shape),
+            action=chosen,
+            reward=reward.view(chosen.shape),
+            alive=~terminated.view(chosen.shape),
+        )
+        self.observations.copy_(lanes.state["observations"].view(self.observations.shape))
+        self._drawn["errors"].index_copy_(0, k, self._learn(draws)[None])
+
+    def _changed(self) -> dict[str, Tensor]:
+        """Return the tensors that a round on the device changes."""
+        count = {} if self.replay.count is None else {"stored": self.replay.count}
+        lanes = cast("DeviceLanes", self.envs.on_device)
+        return {**self.state_dict(), **self._drawn, **count, **prefixed(lanes=lanes.state)}
 
     def _interact(self, actions: Tensor) -> None:
         """Step every environment once and store the S x E transitions."""
@@ -177,7 +225,7 @@ class DDQN:
         action, reward, alive = (batch[name].squeeze(2) for name in ("action", "reward", "alive"))
         seen, after = (masks.observed(batch[name], self.obs_dim) for name in ("seen", "after"))
         with torch.no_grad():
-            best = self._greedy(batch["after"])
+            best = self.choose(batch["after"])
             following = self.target(after).gather(2, best[..., None]).squeeze(2)
         y = reward + self.options.gamma * alive * following
         return chosen_errors(self.online, seen, action.long(), y)
@@ -190,7 +238,8 @@ class DDQN:
         y = reward + self.options.gamma * alive * following
         return torch.from_numpy(online.chosen_errors(batch["seen"], action.astype(np.int64), y))
 
-    def _greedy(self, seen: Tensor) -> Tensor:
+    def choose(self, seen: Tensor) -> Tensor:
+        """Return the greedy actions (S, B) for observations (S, B, obs), and perhaps masks behind them."""
         return masks.best(self.online, seen, self.obs_dim)
 
     def act(
@@ -198,7 +247,7 @@ class DDQN:
     ) -> NDArray[np.int64]:
         """Return the greedy actions (S, B) for observations (S, B, obs), none that `infos` forbid."""
         seen = masks.behind(torch.from_numpy(observations).to(self.device), infos)
-        result: NDArray[np.int64] = self._greedy(seen).cpu().numpy()
+        result: NDArray[np.int64] = self.choose(seen).cpu().numpy()
         return result
 
     def policy_state(self) -> dict[str, Tensor]:
@@ -223,4 +272,5 @@ class DDQN:
         self.adam.load_state_dict(part(state, "adam"))
         self._hold(state["observations"].clone().to(self.device))
         self.replay.rows.copy_(state["buffer"])
-        self.replay.stored, self.epoch = (int(v) for v in state["counters"][0])
+        stored, self.epoch = (int(v) for v in state["counters"][0])
+        self.replay.resume(stored)

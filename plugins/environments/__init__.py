@@ -30,6 +30,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/BeamManagement6G-v1",
             entry_point=f"{_BEAM6G}.env:BeamManagement6G",
             vector=f"{_BEAM6G}.vector:make_vector",
+            device=f"{_BEAM6G}.device:BeamOnDevice",
             policies={
                 "optimal": f"{_BEAM6G}.policies:Optimal",
                 "nearest antenna": f"{_BEAM6G}.policies:NearestAntenna",

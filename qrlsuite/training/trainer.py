@@ -11,11 +11,12 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import os
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ import qrlsuite
 from qrlsuite import actions as action_spaces
 from qrlsuite import own, population, registry, specs
 from qrlsuite.circuit import CircuitModel
-from qrlsuite.device import LateChecks
+from qrlsuite.device import Ahead, Captured, DeviceLanes, LateChecks
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry
@@ -292,7 +293,7 @@ def asks_for_more(function: Callable[..., Any], name: str = "begins") -> bool:
     return any(each.name == name or each.kind is inspect.Parameter.VAR_POSITIONAL for each in given)
 
 
-def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
+def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy], first: Any = None) -> Episodes:
     """Play one episode in every lane.
 
     Parameters
@@ -301,11 +302,13 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         Lanes whose streams are set, with `autoreset` off.
     begin:
         Called after the reset; returns the policy, which may ask for more than observations (`informed`).
+    first:
+        What the reset returned, if the lanes have been reset.
     """
     envs.take_finished()
     envs.take_metrics()
     metrics: dict[str, Floats] = {}
-    observations, infos = envs.reset()
+    observations, infos = envs.reset() if first is None else first
     policy = informed(begin())
     begins = np.ones(envs.num_envs, dtype=np.bool_)
     returns, scores = (np.full(envs.num_envs, np.nan) for _ in range(2))
@@ -331,6 +334,35 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         f"environment '{envs.environment_name}': an episode did not end within {MAX_EPISODE_STEPS} steps; "
         "give it a time limit"
     )
+
+
+class DevicePlayer:
+    """Plays the validation on a device, and then in the lanes themselves, which score it."""
+
+    def __init__(self, envs: MeteredEnv, lanes: DeviceLanes, algorithm: Any, models: ModelBuilder) -> None:
+        self.envs, self.lanes, self.algorithm, self.streams = envs, lanes, algorithm, models.streams
+        self.steps: int = lanes.lanes.options.steps
+        self.drawn = Ahead(self._draw)
+        self._rounds = Captured(self._round, self._state, *models.built)
+
+    def __call__(self, epoch: int) -> Episodes:
+        """Play an epoch's validation."""
+        first, drawn = self.drawn(epoch)
+        self.lanes.begin(self.steps, drawn)
+        self._rounds(self.steps)
+        actions = iter(self.lanes.actions())
+        return play_episodes(self.envs, lambda: lambda observations: next(actions), first)
+
+    def _draw(self, epoch: int) -> tuple[Any, dict[str, Any]]:
+        self.envs.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
+        return self.envs.reset(), self.lanes.draw(self.steps)
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        return {**self.lanes.state, **self.algorithm.policy_state()}
+
+    def _round(self) -> None:
+        seen = self.lanes.state["observations"]
+        self.lanes.step(self.algorithm.choose(seen.view(len(self.streams), -1, seen.shape[1])).view(-1))
 
 
 class ModelBuilder:
@@ -535,6 +567,7 @@ class Trainer:
             self.envs.observe = self.statistics.observe
         self._entries = entries
         self._build({})
+        self.envs.on_device = self._on_device(self.envs)
 
     def _build(self, initial: Mapping[int, Mapping[str, torch.Tensor]]) -> None:
         """Build networks and algorithm; `initial` has the networks' first parameters, by their number."""
@@ -564,6 +597,26 @@ class Trainer:
         envs = build_envs(self.entry, self.S * self.V, self._tick)
         envs.inner.autoreset = False
         return envs
+
+    @functools.cached_property
+    def _player(self) -> DevicePlayer | None:
+        """Plays the validation on the device; None where the processor does."""
+        lanes = self._on_device(self.validation)
+        return None if lanes is None else DevicePlayer(self.validation, lanes, self.algorithm, self.models)
+
+    def _on_device(self, envs: MeteredEnv) -> DeviceLanes | None:
+        """Return lanes as they are played on the device; None where that is not asked for, or cannot be."""
+        spec = self.entry.task.environment
+        if os.environ.get("QRLSUITE_CAPTURE") != "1":
+            return None
+        moves = spec.device is not None and self.statistics is None  # which each epoch replaces
+        if not (moves and hasattr(self.algorithm, "choose")):
+            part = self.entry.algorithm.title if moves else spec.title
+            said = f"QRLSUITE_CAPTURE=1 has no effect: {part} takes no whole epochs to the device"
+            self.progress.warnings += [said] if said not in self.progress.warnings else []
+            return None
+        lanes: DeviceLanes = specs.resolve(cast("str", spec.device))(envs.inner, self.device)
+        return lanes
 
     @own.blamed()
     def start(self, initial: Arrays | None = None) -> None:
@@ -621,6 +674,8 @@ class Trainer:
         self._phase("training", rounds)
         if self.statistics is not None:
             self.statistics.adopt()
+        if self._player is not None:
+            self._player.drawn.begin(self.epoch + 1)
         with self._checks:
             metrics = dict(self.algorithm.train_epoch(rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
@@ -730,10 +785,15 @@ class Trainer:
         buffers = [buffer for model in self.models.built for buffer in model.buffers()]
         before = [buffer.clone() for buffer in buffers]
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
-        self.validation.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
         try:
             with self._checks:
-                episodes = play_episodes(self.validation, lambda: self.act)
+                if self._player is not None:
+                    episodes = self._player(epoch)
+                else:
+                    self.validation.seed_lanes(
+                        [streams.numpy("validation", epoch) for streams in self.streams]
+                    )
+                    episodes = play_episodes(self.validation, lambda: self.act)
         finally:
             with torch.no_grad():
                 for buffer, value in zip(buffers, before):

@@ -1,12 +1,15 @@
 """Where populations are trained, and what is said of a device that is not there."""
 
+import numpy as np
 import pytest
 import torch
 
-from qrlsuite import population
+from qrlsuite import options, population, registry, specs
 from qrlsuite.device import LateChecks
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment import entry as entries
 from qrlsuite.training import device
+from qrlsuite.training.trainer import Trainer
 from tests.algorithms.worlds import Contexts, Group
 
 
@@ -60,18 +63,82 @@ def test_an_update_reads_nothing_from_the_device(monkeypatch, model, decay_steps
     assert len(LateChecks._open._flags) == (model == "vqc-native")
 
 
+def test_a_round_reads_nothing_from_the_device():
+    """A whole epoch of rounds; then the actions are read."""
+    spec, there = registry.get(specs.EnvironmentSpec, "beam6g"), torch.device("meta")
+    envs = specs.resolve(spec.vector)(specs.resolve(spec.options)(), 4)
+    group = Group("ddqn", [0, 1], envs, device="meta", buffer=5, target_steps=2).start()
+    envs.on_device = specs.resolve(spec.device)(envs, there)
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        group.algorithm.train_epoch(3)
+    assert group.algorithm.replay.stored == 6
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        envs.on_device.actions()
+
+
+@pytest.mark.parametrize(
+    ("task", "model", "settings"),
+    [
+        ("beam6g", "mlp", {"buffer": 170, "target_steps": 90, "epsilon_steps": 3000}),
+        ("beam6g-stack", "vqc-native", {"buffer": 2000, "decay_steps": 4000}),
+    ],
+)
+def test_epochs_on_a_device_have_the_same_bits_and_are_continued(monkeypatch, task, model, settings):
+    """Rounds on the device or not, killed after the first epoch or not, and continued in another way."""
+    words = [f"algorithm.{name}={value}" for name, value in settings.items()]
+    words += ["qubits=2"] if model != "mlp" else ["width=16"]
+    entry = entries.resolve(task, model, "ddqn", [options.parse_setting(word) for word in words], None)
+
+    def trained(*ways, stopped=False):
+        epochs, saved = [], None
+        trainer = Trainer(entry, [3, 8])
+        for number, way in enumerate(ways):
+            monkeypatch.setenv("QRLSUITE_CAPTURE", way)
+            if number in (0, 1) and (stopped or not number):
+                trainer = Trainer(entry, [3, 8])
+                if saved is None:
+                    trainer.start()
+                else:
+                    trainer.restore(number, saved)
+            assert (trainer.envs.on_device is not None) == (way == "1")
+            epochs.append(trainer.train_epoch())
+            saved = trainer.capture()
+        return epochs, saved
+
+    epochs, arrays = trained("", "", "")
+    for ways, stopped in (("111", False), ("1  ", True), (" 11", True)):
+        others, found = trained(*ways, stopped=stopped)
+        for one, other in zip(epochs, others):
+            assert np.array_equal(one.scores, other.scores)
+            assert one.executions == other.executions
+            for name, values in one.metrics.items():
+                assert np.array_equal(values, other.metrics[name], equal_nan=True), name
+        assert found.keys() == arrays.keys()
+        assert all(np.array_equal(found[name], value, equal_nan=True) for name, value in arrays.items())
+
+
+@pytest.mark.parametrize(("task", "algorithm"), [("cartpole", "ddqn"), ("beam6g", "ppo")])
+def test_what_takes_no_epochs_to_the_device_goes_on_as_ever_and_says_so(monkeypatch, task, algorithm):
+    monkeypatch.setenv("QRLSUITE_CAPTURE", "1")
+    trainer = Trainer(entries.resolve(task, "mlp", algorithm, [], None), [0])
+    trainer.start()
+    trainer.train_epoch()
+    part = "environment 'cartpole'" if algorithm == "ddqn" else "algorithm 'ppo'"
+    assert [each for each in trainer.progress.warnings if "QRLSUITE_CAPTURE" in each] == [
+        f"QRLSUITE_CAPTURE=1 has no effect: {part} takes no whole epochs to the device"
+    ]
+
+
 def test_numbers_on_a_device_are_checked_where_the_block_ends():
     checks, owner = LateChecks(), object()
 
     def note(*found):
         with checks:
-            assert all(
-                LateChecks.note(owner, torch.tensor(each), lambda: OptionError("late")) for each in found
-            )
+            assert all(LateChecks.note(owner, torch.tensor(each), OptionError("late")) for each in found)
             if not found:
                 raise KeyError
 
-    assert not LateChecks.note(owner, torch.tensor(True), OptionError)
+    assert not LateChecks.note(owner, torch.tensor(True), OptionError("late"))
     with pytest.raises(OptionError, match="late"):
         note(False, True)
     note(True)

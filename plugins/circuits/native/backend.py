@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from qrlsuite.plugins.circuits.native.sampling import ShotSampler
 
 NOT_FINITE = "the circuit's inputs or parameters are not finite (NaN or infinite)"
+NOT_FINITE_LATE = f"{NOT_FINITE}, or an angle is too large: make learning rates or initial parameters smaller"
 ROUNDED = {torch.float32: "1e7", torch.float64: "1e15"}
 """Angles from which on a number is rounded by about a radian: sine and cosine of it mean nothing."""
 
@@ -92,7 +93,7 @@ class NativeBackend:
         flat = self._flat(inputs, parameters)
         result = self._run(inputs, flat)
         finite = torch.isfinite(result.detach().sum())
-        late = not result.is_cpu and LateChecks.note(self, finite, _refused)
+        late = not result.is_cpu and LateChecks.note(self, finite, OptionError(NOT_FINITE_LATE))
         if not late and not bool(finite):
             raise OptionError(_cause(inputs, flat))
         return result
@@ -230,13 +231,6 @@ def _check(options: NativeOptions, circuit: Circuit) -> None:
             "the mean-field approximation of a circuit is none, so it has no shots, noise or gradient rule; leave out "
             "shots, noise_model and gradient"
         )
-
-
-def _refused() -> OptionError:
-    """Return the refusal of values that were found in an epoch on a device: the inputs are no more."""
-    return OptionError(
-        f"{NOT_FINITE}, or an angle is too large: make learning rates or initial parameters smaller"
-    )
 
 
 def _cause(inputs: Tensor, flat: Tensor) -> str:

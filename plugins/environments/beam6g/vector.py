@@ -142,6 +142,10 @@ class BeamLanes(LaneEnv):
         self._observations[lanes] = np.tile(first, (1, self.options.stack))
         self._pending[lanes] = True
 
+    def restart(self) -> None:
+        """Begin the next episode in every lane."""
+        self._begin(self._lane)
+
     @property
     def steps(self) -> NDArray[np.int64]:
         """Actions so far of every lane's episode (L,)."""
