@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-vectors test-long breaks test-lowest verify docs tutorials site pictures statements dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-vectors test-long breaks test-lowest verify docs words tutorials site pictures statements dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -62,6 +62,10 @@ verify: install
 docs: install-dev
 	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
 	QRLSUITE_DOCS_PACKAGE=$(VENV)/wheel NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Words by page: prose, tables and code apart, generated pages by themselves.
+words:
+	@$(PYTHON) docs/words.py
 
 # Executes docs/tutorials in a kernel, each in a folder of its own, and stores them with their output, without timings;
 # what a tutorial trains is left in a folder of the virtual environment.
