@@ -72,9 +72,9 @@ words:
 tutorials: install-dev
 	rm -rf $(VENV)/tutorials
 	mkdir -p $(VENV)/tutorials
-	cp docs/tutorials/*.ipynb $(VENV)/tutorials
-	cd $(VENV)/tutorials && $(abspath $(BIN))/python -c "import glob, nbclient, nbformat, os; \
-	  [nbformat.write(nbclient.execute(nbformat.read(path, 4), cwd=(os.mkdir(path + '.runs') or path + '.runs'), \
+	cp -r docs/tutorials/*.ipynb docs/tutorials/data $(VENV)/tutorials
+	cd $(VENV)/tutorials && $(abspath $(BIN))/python -c "import glob, nbclient, nbformat, os, shutil; \
+	  [nbformat.write(nbclient.execute(nbformat.read(path, 4), cwd=os.path.dirname(shutil.copytree('data', path + '.runs/data')), \
 	  record_timing=False, coalesce_streams=True), path) for path in sorted(glob.glob('*.ipynb'))]"
 	cp $(VENV)/tutorials/*.ipynb docs/tutorials
 

@@ -1,10 +1,11 @@
 """Why outputs that are given sixteen times to a linear layer learn faster: `python benchmarks/output_reuse.py`.
 
 Under Adam, sixteen copies of a weight move as their sum with sixteen times the rate. The script first trains PPO with
-`output_reuse=16`, and PPO with a 16-fold rate of the weights alone, from the same sums, and prints how far apart their
-parameters are after six epochs in float64. Then it trains 20 seeds of each of four variants, from 1,000,000 up, and
-prints the steps below threshold of docs/claims.md: mean and 95% interval. Four core-minutes. The rate of the weights
-alone, and the size of the first biases, are no options of the suite: they are set here by replacing two functions.
+`output_reuse=16`, and PPO with a 16-fold rate of the weights alone, from the same sums, and prints how far apart
+their parameters are after six epochs in float64. Then it trains 20 seeds of each of four variants, from 1,000,000 up,
+and prints the steps below threshold of docs/results/dissecting.md: mean and 95% interval. Four core-minutes. The rate
+of the weights alone, and the size of the first biases, are no options of the suite: they are set here by replacing
+two functions.
 """
 
 from __future__ import annotations

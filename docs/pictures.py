@@ -1,5 +1,7 @@
 """How every picture of docs/images is made: `make pictures`, in the root of the repository.
 
+Each published study and board has one, and `episode.gif` plays an agent; the others are of the pages by hand.
+
 A picture of published entries carries a mark, a hash of these entries and of its command. Where entries have changed
 since, `tests/docs/test_pictures.py` says that it is stale. Pictures of runs that are not published stay as they are;
 they are listed with the command that trains the runs and draws them.
@@ -20,12 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import Image, ImageSequence
 from PIL.PngImagePlugin import PngInfo
+from tables import PAIRS, ROOT, short_names
 
+from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import AGENTS, encode_record
 
-ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
 MARK = "qrlsuite-made-from"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -33,7 +36,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture that a command draws from published entries.
+    """A picture, or an animation, that a command makes of published entries.
 
     Attributes
     ----------
@@ -81,11 +84,33 @@ PICTURES: dict[str, Picture] = {
         "plot curves --task cartpole --published --entry reinforce-mlp-08663f8a --entry reinforce-vqc-native-f64996c4",
         ("entries/cartpole/reinforce*",),
     ),
-    "curves.png": Plot(
+    "board-beam6g.png": Plot(
         "plot curves --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=16 lr=0.002' "
         "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
         ("entries/beam6g/*",),
     ),
+    **{
+        f"board-{task}.png": Plot(
+            shlex.join(
+                ["plot", "curves", "--task", task, "--published"]
+                + [
+                    word
+                    for entry, name in short_names(task).items()
+                    for word in ("--label", f"{entry}={name}")
+                ]
+            ),
+            (f"entries/{task}/*",),
+        )
+        for task in PAIRS
+    },
+    "episode.gif": Plot(
+        "play 'vqc-native qubits=10' --task beam6g --published --episode 3",
+        ("entries/beam6g/ddqn-vqc-native-*",),
+    ),
+    **{
+        f"study-{name}.png": Plot(f"plot pairs --study {name}", (f"plans/{name}", f"plans/{name}/*/*"))
+        for name in published_studies.names()
+    },
     "diagnose-circuit.png": Plot("diagnose ansatz iqp qubits=2:16:2", ()),
     "diagnose-agents.png": Plot(
         "diagnose 'vqc-native qubits=6' --task beam6g --published", ("entries/beam6g/ddqn-vqc-native-*",)
@@ -127,15 +152,6 @@ PICTURES: dict[str, Picture] = {
     "study-fig1-surface.png": Plot("plot surface --study fig1 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig6-bars.png": Plot("plot bars --study fig6 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig7-scaling.png": Plot("plot scaling --study fig7 --published --seeds 30", ("entries/beam6g/*",)),
-    **{
-        f"study-quantum-or-not-{kind}.png": Plot(
-            f"plot {kind} --study quantum-or-not", ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
-        )
-        for kind in ("pairs", "entries")
-    },
-    "study-larger-batch-entries.png": Plot(
-        "plot entries --study larger-batch", ("plans/larger-batch", "plans/larger-batch/beam6g/*")
-    ),
     "study-equal-size-tasks.png": Plot(
         "plot pairs --study equal-size-beam6g --study equal-size-beam6g-degree5 --study equal-size-beam6g-a3-0 "
         "--study equal-size-cartpole --study equal-size-frozenlake --study equal-size-vqe-h2 --study equal-size-pulse",
@@ -149,58 +165,6 @@ PICTURES: dict[str, Picture] = {
     "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),
     "episode-vqe.png": Plot("plot episode seed=2 --task vqe-ising", ()),
 }
-
-CAPTIONS = {
-    "field.png": "The task: which antenna serves each place best",
-    "curves.png": "Learning curves on beam6g",
-    "cartpole.png": "Learning curves on CartPole",
-    "study-fig1-surface.png": "Surfaces of sample complexity",
-    "study-fig6-bars.png": "Sample complexity as bars",
-    "study-fig7-scaling.png": "Scaling with the size of networks and circuits",
-    "study-ablation-layers.png": "Scaling with the layers of a circuit",
-    "study-degree-scaling.png": "Scaling with the degree of the paths",
-    "study-antennas-scaling.png": "Scaling with the number of antennas",
-    "study-ppo-bars.png": "PPO as bars",
-    "study-fidelity-text.png": "The text's replay buffer and copies",
-    "study-quantum-or-not-entries.png": "A study with looks: every entry",
-    "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
-    "study-equal-size-tasks.png": "Studies of several tasks: every pair, task by task",
-    "study-equal-size-ppo-tasks.png": "Studies with PPO: every pair on two tasks",
-    "study-larger-batch-entries.png": "A study with looks: where models learn in a third of the steps",
-    "predictors.png": "Sixteen circuits: how fast they learn, and what was known of them before",
-    "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",
-    "diagnose-agents.png": "Trained agents beside themselves before training",
-    "policies.png": "What trained agents earn",
-    "study-deploy-shots.png": "Trained agents that act with shots",
-    "study-deploy-errors.png": "Trained agents that act with gate errors",
-    "study-shots-costs.png": "Training with shots, by steps, executions and shots",
-    "study-shots-curves.png": "Training with shots, learning curves",
-    "episode-pulse.png": "A quantum task: the best switched field, and the path of the qubit",
-    "episode-vqe.png": "A quantum task: the best known circuit for a ground state",
-    "report-wide.png": "The board as a page",
-    "report-pairs.png": "The page: who outperforms whom",
-    "report-narrow.png": "The page on a phone",
-}
-"""What the gallery says above each picture, in its order."""
-
-
-def gallery() -> str:
-    """Return docs/gallery.md: every picture below the command that makes it."""
-    text = (
-        "# Gallery\n\nEvery picture of these pages, with the command that makes it. Without `--published` a command "
-        "shows your own\nruns. `qrlsuite show picture KIND` lists what you can change.\n"
-    )
-    for name, caption in CAPTIONS.items():
-        picture = PICTURES[name]
-        note = "\nIts runs are not published: the command needs agents or seeds that you train.\n"
-        lines = [f"qrlsuite {picture.command}"]
-        if isinstance(picture, Unpublished):
-            lines = [f"qrlsuite {picture.trained}"] * bool(picture.trained) + [
-                f"{picture.program} {picture.command}"
-            ]
-        text += "\n".join([f"\n## {caption}\n\n```sh", *lines, "```\n"])
-        text += note * isinstance(picture, Unpublished) + f"\n![{caption}](images/{name})\n"
-    return text
 
 
 def made_from(picture: Plot | Screenshot) -> str:
@@ -227,7 +191,8 @@ def _shown(path: Path) -> bytes:
 def mark_of(path: Path) -> str | None:
     """Return the mark that a picture carries."""
     with Image.open(path) as image:
-        return image.info.get(MARK)
+        comment = image.info.get("comment", b"").decode()
+        return image.info.get(MARK) or comment.removeprefix(f"{MARK} ") or None
 
 
 def main(chosen: Sequence[str]) -> None:
@@ -251,7 +216,6 @@ def main(chosen: Sequence[str]) -> None:
                 _photograph(chromium, page, picture, made)
             _mark(made, made_from(picture), IMAGES / name)
             print(f"made {name}: qrlsuite {picture.command}")
-    (ROOT / "docs" / "gallery.md").write_text(gallery())
 
 
 def _run(command: str, out: Path) -> None:
@@ -262,9 +226,18 @@ def _run(command: str, out: Path) -> None:
 
 
 def _mark(made: Path, mark: str, place: Path) -> None:
-    info = PngInfo()
-    info.add_text(MARK, mark)
+    """Store a picture in few colors with its mark; of an animation every second frame."""
     with Image.open(made) as image:
+        if place.suffix == ".gif":
+            images = [each.convert("RGB") for each in ImageSequence.Iterator(image)][::2]
+            colors = images[-1].quantize(64, dither=Image.Dither.NONE)
+            first, *rest = (each.quantize(palette=colors, dither=Image.Dither.NONE) for each in images)
+            comment = f"{MARK} {mark}".encode()
+            shown = {"duration": 100, "loop": 0, "optimize": True}
+            first.save(place, save_all=True, append_images=rest, comment=comment, **shown)
+            return
+        info = PngInfo()
+        info.add_text(MARK, mark)
         image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(place, pnginfo=info, optimize=True)
 
 

@@ -1,21 +1,21 @@
-"""The tables of published boards and studies with looks in docs: `make pictures` writes them anew.
+"""Tables of published boards and studies with looks. `make pictures` writes them anew, with the pages of results.
 
-A comment names the task or study and the kind of the table that follows it:
+On a page by hand, a comment names the task or the studies and the kind of the table that follows it:
 
     <!-- table: beam6g tiers -->
-    <!-- table: quantum-or-not verdicts -->
-    <!-- table: quantum-or-not-degree5+quantum-or-not-a3-0 together -->
-    <!-- table: equal-size-beam6g+equal-size-pulse means -->
+    <!-- table: equal-size-beam6g+equal-size-pulse rivals -->
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from statements import MODELS, each_model, load
 
@@ -23,7 +23,7 @@ from qrlsuite import api
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf import published_studies
-from qrlsuite.leaderboard.shelf.published import read
+from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.results.text import hours_text, interval_text, mean_text, steps_text
 from qrlsuite.studies.state import State, by_question, difference_text, versus
 from qrlsuite.studies.together import together
@@ -33,10 +33,9 @@ ROOT = Path(__file__).parents[1]
 PAGES = [
     ROOT / page
     for page in (
+        "docs/compare.md",
         "docs/fidelity.md",
-        "docs/leaderboard.md",
-        "docs/plans.md",
-        "docs/quantum-or-not.md",
+        "docs/findings.md",
         "leaderboard/README.md",
     )
 ]
@@ -83,7 +82,8 @@ def entries(outcome: State) -> Rows:
     for entry in outcome.as_dict()["entries"]:
         if entry["mean_time"] is not None:
             took = interval_text(mean_text, entry["mean_time"], *entry["mean_time_interval"])
-            executed = read(folder / outcome.study.task / entry["entry"]).executions.mean()
+            trained = outcome.study.entries[entry["name"]]
+            executed = read(folder / trained.task.name / trained.name).executions.mean()
             circuits = f"{executed / 1e6:.1f} million" if executed else ""
             yield (
                 entry["name"],
@@ -114,7 +114,20 @@ def means(names: str) -> Rows:
         yield f"`{outcome.study.task}`", counts, *steps
 
 
-OF_SEVERAL: dict[str, Callable[[str], Rows]] = {"together": of_several, "means": means}
+def rivals(names: str) -> Rows:
+    """How many more steps each rival needs than the first entry, a row for each study's task."""
+    outcomes = [published(name) for name in names.split("+")]
+    first, *others = [str(each.name) for each in outcomes[0].study.file.entries]
+    yield "task", *others, "after seeds"
+    for outcome in outcomes:
+        found = {pair.second: pair for pair in outcome.pairs if pair.first == first}
+        cells = []
+        for pair in (found[other] for other in others):
+            share, interval = difference_text(pair, outcome.study.grid)
+            said = "" if pair.verdict.startswith("not told") else f", {outcome.verdict(pair)}"
+            cells.append(f"{share} ({interval}){said}")
+        seeds = sorted({pair.n_runs for pair in found.values()})
+        yield f"`{outcome.study.task}`", *cells, " to ".join(map(str, sorted({seeds[0], seeds[-1]})))
 
 
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:
@@ -165,11 +178,21 @@ def _short(label: str) -> str:
     return f"{'jerbi' if 'ansatz=jerbi' in words else 'iqp'} {control}".strip()
 
 
+def short_names(task: str) -> dict[str, str]:
+    """Return the short names of a board's entries; of another algorithm than most, with it."""
+    records = [json.loads(path.read_text()) for path in sorted((PUBLISHED / task).glob("*/entry.json"))]
+    labels = {record["name"]: record["label"] for record in records}
+    [(most, _)] = Counter(label.split()[0] for label in labels.values()).most_common(1)
+    return {
+        name: _short(label) if label.startswith(most) else f"{label.split()[0]} {_short(label)}"
+        for name, label in labels.items()
+    }
+
+
 def pairs(task: str) -> Rows:
     """The pairs that answer the questions of a board: each by itself, and what the board decides."""
     yield "question", "pair", "difference (95%)", "on the board"
-    section = main_section(api.board(task, published=True, runs="none").sections)
-    facts = section.as_dict()
+    facts = main_facts(task)
     order = [row["entry"] for row in facts["times"]["entries"]]
     [(algorithm, _)] = Counter(row["label"].split()[0] for row in facts["rows"]).most_common(1)
     rows = {_short(row["label"]): row for row in facts["rows"] if row["label"].split()[0] == algorithm}
@@ -225,17 +248,11 @@ def changes(task: str) -> Rows:
             yield title, label.removeprefix("ddqn "), str(board.n_runs[0]), before, after, said
 
 
-OF_STUDIES: dict[str, Callable[[State], Rows]] = {
-    "settings": settings,
-    "verdicts": verdicts,
-    "entries": entries,
-}
-OF_BOARDS: dict[str, Callable[[str], Rows]] = {
-    "board": board,
-    "pairs": pairs,
+TABLES: dict[str, Callable[[str], Rows]] = {
     "tiers": tiers,
     "executions": executions,
     "changes": changes,
+    "rivals": rivals,
 }
 
 
@@ -249,21 +266,26 @@ def published(name: str) -> State:
     return published_studies.read(published_studies.PUBLISHED / name)
 
 
+@cache
+def main_facts(task: str) -> dict[str, Any]:
+    """Return the board of a task at its main horizon, as plain values."""
+    return main_section(api.board(task, published=True, runs="none").sections).as_dict()
+
+
+def markdown(rows: Iterable[Sequence[str]]) -> str:
+    """Return rows as a table; the first one is its head."""
+    header, *body = rows
+    lines = [header, ["---"] * len(header), *body]
+    return "\n".join("|" + "|".join(map(_padded, line)) + "|" for line in lines).replace(" --- ", "---")
+
+
 def filled(text: str) -> str:
     """Return a page with every table as the published entries and studies now give it."""
 
     def table(found: re.Match[str]) -> str:
         name, kind = found.groups()
-        if kind in OF_SEVERAL:
-            header, *rows = OF_SEVERAL[kind](name)
-        elif kind in OF_BOARDS:
-            header, *rows = OF_BOARDS[kind](name)
-        else:
-            header, *rows = OF_STUDIES[kind](published(name))
-        lines = [header, ["---"] * len(header), *rows]
-        body = "\n".join("|" + "|".join(map(_padded, line)) + "|" for line in lines)
         asked = found[0].partition(" -->")[0]
-        return f"{asked} -->\n\n{body.replace(' --- ', '---')}\n\n"
+        return f"{asked} -->\n\n{markdown(TABLES[kind](name))}\n\n"
 
     return TABLE.sub(table, text)
 

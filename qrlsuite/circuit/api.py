@@ -146,7 +146,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     if not isinstance(circuit, Circuit):
         raise PluginError(
             f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit of qrlsuite.circuit; "
-            "a QNode stands in the file by itself, see docs/circuits.md#circuits-out-and-in"
+            "a QNode stands in the file by itself, see docs/your-circuit.md"
         )
     return circuit
 

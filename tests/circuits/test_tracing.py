@@ -174,9 +174,9 @@ def test_values_and_gradients_are_those_of_pennylane(
 
 
 def test_the_function_on_the_page_is_an_ansatz_of_every_size(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "circuits.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "your-circuit.md").read_text()
     file = tmp_path / "mine.py"
-    file.write_text("# mine.py" + page.partition("# mine.py")[2].partition("```")[0])
+    file.write_text("# swirl.py" + page.partition("# swirl.py")[2].partition("```")[0])
     own.load(file)
     for qubits, layers in ((1, 1), (2, 1), (4, 3)):
         circuit = ansatz("swirl", qubits, layers)

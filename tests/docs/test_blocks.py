@@ -18,13 +18,12 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 ELSEWHERE = {
     "decisions.md": "tests/cli/test_looks.py",
-    "plugins.md": "test_plugins.py",
     "statistics.md": "tests/statistics/test_docs.py",
 }
 """Pages whose blocks other tests run."""
-PRINTED = (("README.md", 0), ("index.md", 0))
+PRINTED = (("index.md", 0),)
 """Blocks whose output is on the page, too."""
-OWN_FILE = ("# ring.py\n", "# mine.py\n")
+OWN_FILE = ("# ring.py\n", "# mine.py\n", "# swirl.py\n", "# agent.py\n")
 
 
 def blocks() -> list[Any]:
@@ -66,22 +65,19 @@ def test_a_block_runs(text: str, results: Path, capsys: pytest.CaptureFixture[st
         names["env"].close()
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
-def test_what_the_first_lines_print_is_below_them(
-    page: str, results: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = (ROOT / page).read_text()
+def test_what_the_first_lines_print_is_below_them(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs/index.md").read_text()
     code, printed = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, re.DOTALL)[0]
     exec(code, {})
     assert capsys.readouterr().out == printed
 
 
-def test_the_readmes_plugin_is_what_its_summary_says_and_conforms(tmp_path: Path) -> None:
+def test_the_ring_is_what_its_summary_says_and_conforms(tmp_path: Path) -> None:
     """RX of every input, RY of every weight, and a ring: each qubit has two CZs, the last one with the first."""
-    text = (ROOT / "README.md").read_text()
+    text = (ROOT / "docs" / "your-circuit.md").read_text()
     (code,) = re.findall(rf"```python\n{OWN_FILE[0]}(.*?)```", text, re.DOTALL)
     space: dict[str, Any] = {}
-    exec(compile(code, "README.md", "exec"), space)
+    exec(compile(code, "your-circuit.md", "exec"), space)
     assert space["ry_ring"].__doc__ == "RX re-uploading, RY weights and a ring of CZs."
     circuit = space["ry_ring"](4, 1)
     gates = [(step.gate, step.wires) for step in circuit.operations]
@@ -93,10 +89,15 @@ def test_the_readmes_plugin_is_what_its_summary_says_and_conforms(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("name", "registers"), [("mine", "ansatz chain, model hybrid"), ("agent", "algorithm actor-critic")]
+    ("page", "name", "registers"),
+    [
+        ("plugins", "mine", "ansatz chain, model hybrid"),
+        ("your-algorithm", "agent", "algorithm actor-critic"),
+        ("your-circuit", "swirl", "ansatz swirl"),
+    ],
 )
-def test_the_plugins_by_path_conform(name: str, registers: str, tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "plugins.md").read_text()
+def test_the_plugins_by_path_conform(page: str, name: str, registers: str, tmp_path: Path) -> None:
+    text = (ROOT / "docs" / f"{page}.md").read_text()
     (code,) = re.findall(rf"```python\n# {name}.py\n(.*?)```", text, re.DOTALL)
     (tmp_path / f"{name}.py").write_text(code)
     checked = qrlsuite("check", f"{name}.py", "--plugin", f"{name}.py", cwd=tmp_path)
@@ -106,7 +107,7 @@ def test_the_plugins_by_path_conform(name: str, registers: str, tmp_path: Path) 
 
 def test_the_methods_on_the_page_are_those_of_an_algorithm() -> None:
     table = (
-        (ROOT / "docs" / "plugins.md")
+        (ROOT / "docs" / "your-algorithm.md")
         .read_text()
         .partition("| Method | What it does |\n")[2]
         .partition("\n\n")[0]

@@ -19,17 +19,14 @@ pictures = load("pictures")
 PUBLISHED = {name: of for name, of in pictures.PICTURES.items() if not isinstance(of, pictures.Unpublished)}
 
 
-def test_every_picture_has_a_command_and_a_page_and_is_in_the_gallery() -> None:
-    assert (
-        {path.name for path in pictures.IMAGES.iterdir()} == set(pictures.PICTURES) == set(pictures.CAPTIONS)
-    )
-    assert (ROOT / "docs" / "gallery.md").read_text() == pictures.gallery(), "run `make pictures`"
+def test_every_picture_has_a_command_and_a_page() -> None:
+    assert {path.name for path in pictures.IMAGES.iterdir()} == set(pictures.PICTURES)
     shown = [
-        re.findall(r"\((?:docs/)?images/([\w.-]+)\)", page.read_text())
+        re.findall(r"\((?:docs/|../)?images/([\w.-]+)\)", page.read_text())
         for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))
-        if page.name != "gallery.md"
     ]
     assert {name for names in shown for name in names} == set(pictures.PICTURES)
+    assert (pictures.IMAGES / "episode.gif").stat().st_size < 1_000_000
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

@@ -1,6 +1,6 @@
-"""docs/plugins.md shows a package that works: the files of `tests/third_party/acme-qrl`, put in when it is built.
+"""Pages show a package that works: the files of `tests/third_party/acme-qrl`, put in when they are built.
 
-`tests/third_party/test_stranger.py` installs that package, and runs the commands of the page.
+`tests/third_party/test_stranger.py` installs that package, and runs the commands of the pages.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from qrlsuite.specs import KINDS
 from tests.testing.test_builtins import RULES
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "plugins.md").read_text()
+PAGES = ("your-algorithm", "your-environment", "plugins")
+PAGE = "\n".join((ROOT / "docs" / f"{page}.md").read_text() for page in PAGES)
 PACKAGE = ROOT / "tests" / "third_party" / "acme-qrl"
 FILES = re.findall(r'\*\*`(\S+)`\*\*\n\n``` {\.(?:python|toml)}\n--8<-- "(\S+)"\n```\n', PAGE)
 """The name above each block, and the file that is put into it."""

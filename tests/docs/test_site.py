@@ -61,7 +61,7 @@ def test_the_plugins_files_are_on_their_page(site: Path) -> None:
 
 def test_tutorials_are_pages_with_their_output(site: Path) -> None:
     notebooks = list((ROOT / "docs" / "tutorials").glob("*.ipynb"))
-    assert len(notebooks) == 3
+    assert len(notebooks) == 4
     for notebook in notebooks:
         text = (site / "tutorials" / f"{notebook.stem}.html").read_text()
         assert '<div class="output">' in text

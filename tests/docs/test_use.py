@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -61,10 +62,17 @@ def test_the_examples_run_in_their_order(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(list((tmp_path / "entries" / "beam6g").iterdir())) == 1
 
 
-def test_the_readmes_first_comparison_runs_as_printed(tmp_path: Path) -> None:
-    for words in commands("README.md", "A first comparison"):
-        done = qrlsuite(*words, *SMALL.get(words[0], ()), cwd=tmp_path)
+def test_the_readmes_three_commands_print_what_is_below_them(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "docs" / "tutorials" / "data", tmp_path / "docs" / "tutorials" / "data")
+    said = ""
+    for words in commands("README.md", "Three commands"):
+        done = qrlsuite(*words, cwd=tmp_path)
         assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}{done.stderr}"
+        said += " ".join(done.stdout.split())
+    (printed,) = re.findall(r"```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    verdicts = [" ".join(verdict.split()) for verdict in printed.split("\n\n")]
+    assert len(verdicts) == 2
+    assert [verdict for verdict in verdicts if verdict not in said] == []
 
 
 def test_the_search_starts_as_printed(tmp_path: Path) -> None:

@@ -518,7 +518,7 @@ def test_the_container_fixes_the_instruction_sets_that_are_recorded() -> None:
 
 
 def test_the_page_says_how_many_seeds_are_trained_again() -> None:
-    page = " ".join((Path(published.PUBLISHED).parents[1] / "docs" / "verification.md").read_text().split())
+    page = " ".join((Path(published.PUBLISHED).parents[1] / "docs" / "publish.md").read_text().split())
     said = ", ".join(f"{verify.needed(count)} of {count}" for count in (100, 20))
     assert f"probability .95: {said}." in page
 

@@ -17,6 +17,7 @@ import pytest
 
 from tests.commands import Command, qrlsuite
 from tests.conftest import HANGS
+from tests.docs.test_plugins import PAGES
 
 pytestmark = pytest.mark.long
 
@@ -170,9 +171,9 @@ def ranked(installed: Installation) -> Path:
 
 
 def test_the_commands_of_the_page_run(installed: Installation, ranked: Path) -> None:
-    """docs/plugins.md, in its order; `new` and installing have tests of their own."""
+    """Pages of plugins, in their order; `new` and installing have tests of their own."""
     shutil.copytree(ranked, installed.folder / "runs")
-    page = (ROOT / "docs" / "plugins.md").read_text()
+    page = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in PAGES)
     files = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", page, re.DOTALL))
     assert set(files) == {"mine.py", "agent.py"}
     for name, code in files.items():

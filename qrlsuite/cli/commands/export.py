@@ -95,7 +95,7 @@ def shortfalls(entry: EntryResults) -> Iterator[str]:
     if entry.plugins:
         yield (
             f"made with {', '.join(sorted(entry.plugins))}, which is not in it: verify needs --plugin PATH, and "
-            "a public board an issue first (docs/add-an-entry.md)"
+            "a public board an issue first (docs/publish.md)"
         )
 
 
