@@ -83,11 +83,12 @@ site: docs
 	$(BIN)/qrlsuite leaderboard --published --runs $(VENV)/no-runs --format html --out site/board.html
 	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board.html
 
-# Every picture of docs/images that shows published entries (docs/pictures.py lists all, with their commands), and the
-# tables of published boards and studies.
+# Every picture of docs/images that shows published entries (docs/pictures.py lists all, with their commands: README's
+# animation is episode.gif), the tables of published boards and studies, and their pages in docs/results.
 pictures: install-dev
 	$(BIN)/python docs/pictures.py
 	$(BIN)/python docs/tables.py
+	$(BIN)/python docs/results.py
 
 # The table of the paper's statements, docs/statements.csv, from what is published; it takes a minute.
 statements: install-dev
