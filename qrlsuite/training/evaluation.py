@@ -277,14 +277,14 @@ def _perturbing(agents: Trainer, scale: float, streams: Streams) -> Callable[[in
     """Return a function that perturbs the agents' trained numbers by a relative size, anew for each round."""
     learned = {p.data_ptr() for model in agents.models.built for p in model.parameters() if p.requires_grad}
     state = agents.algorithm.policy_state()
-    tensors = [state[name].detach() for name in sorted(state) if state[name].data_ptr() in learned]
-    exact = [tensor.clone() for tensor in tensors]
+    exact = {n: state[n].detach().clone() for n in sorted(state) if state[n].data_ptr() in learned}
 
     def draw(block: int) -> None:
         drawn = [streams.numpy(f"evaluation perturbation {seed}", block) for seed in agents.seeds]
-        for tensor, value in zip(tensors, exact):
+        now = agents.algorithm.policy_state()  # a pass may move parameters in memory
+        for name, value in exact.items():
             noise = np.stack([stream.standard_normal(value.shape[1:]) for stream in drawn])
-            tensor.copy_(value * (1.0 + scale * torch.from_numpy(noise).to(value)))
+            now[name].detach().copy_(value * (1.0 + scale * torch.from_numpy(noise).to(value)))
 
     return draw
 
