@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
@@ -31,19 +31,6 @@ def axes_of(entries: Sequence[EntryResults]) -> tuple[str, ...]:
     """Return the axes that rank these entries: `AXES`, and the costs that their tasks name."""
     named = {name for entry in entries for name in entry.task_file.ranking.costs}
     return (*AXES, *sorted(named - set(AXES)))
-
-
-class Section(Protocol):
-    """A table of a board: one task at one horizon, or several tasks."""
-
-    def sheet(self, explain: bool = False) -> Sheet:
-        """Return it as a table; `explain` adds all its notes."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-
-    def flat(self) -> list[dict[str, object]]:
-        """Return one row of values per entry, for a spreadsheet."""
 
 
 @dataclass(frozen=True, repr=False)

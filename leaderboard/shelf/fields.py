@@ -185,12 +185,6 @@ def _metric(entry: EntryResults, found: NDArray[np.float64] | None, rows: Rows) 
     return pyarrow.array(np.array(shown), _REAL, from_pandas=True)
 
 
-def facts(entry: EntryResults) -> dict[str, Any]:
-    """Return an entry's row as plain values."""
-    [row] = table([entry], "entries").to_pylist()
-    return dict(row)
-
-
 def options_of(identity: Mapping[str, Any]) -> dict[str, Any]:
     """Return every option that an entry's identity states, by the name of its column."""
     task = identity.get("task")

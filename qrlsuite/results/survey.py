@@ -57,11 +57,6 @@ class EntrySurvey:
     problems: tuple[str, ...] = ()
 
 
-def survey(runs: Path, task: str | None = None) -> list[EntrySurvey]:
-    """Look at every entry below a results folder; damage is reported per entry, never raised."""
-    return [look(store) for store in entries(runs, task)]
-
-
 def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurvey:
     """Look at one entry.
 

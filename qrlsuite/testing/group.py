@@ -27,10 +27,6 @@ from qrlsuite.training.trainer import asks_for_more, build_envs
 
 E, OBS, ACTIONS, ROUNDS = 2, 4, 3, 40
 
-Saved = Mapping[str, NDArray[Any]]
-"""All that a group has, seed-first."""
-
-
 SPACES: dict[str, gymnasium.Space[Any]] = {
     "discrete": Discrete(ACTIONS),
     "multi-discrete": MultiDiscrete([ACTIONS, 2]),

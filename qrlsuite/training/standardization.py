@@ -40,8 +40,6 @@ EPSILON = 1e-8
 PREFIX = "observation_statistics."
 """Prefix of the statistics' names among an agent's parameters and in a checkpoint."""
 
-Floats = NDArray[np.float64]
-
 
 class RunningStatistics:
     """The statistics of S seeds with E environments each, and the standardization by them.
