@@ -292,7 +292,6 @@ class GymLanes(LaneEnv):
 
 
 def _places(env_id: str, observe: Sequence[int], flat: spaces.Box) -> NDArray[np.int64]:
-    """Return the places of the shown values of an observation."""
     places = np.array(observe, dtype=np.int64)
     size = int(np.prod(flat.shape))
     if not places.size or len(set(observe)) < len(observe) or places.min() < 0 or places.max() >= size:

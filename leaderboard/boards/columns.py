@@ -356,6 +356,5 @@ def facts(section: Section) -> list[Column[Row]]:
 
 
 def _complexity(section: Section) -> str:
-    """Define the sample complexity in words."""
     goal = "score 1 - epsilon or more" if section.times.kind == "epsilon" else "have reached a threshold"
     return f"steps until a share delta of the seeds {goal}, here at {section.ranking.cell}"

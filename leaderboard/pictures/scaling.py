@@ -185,7 +185,6 @@ def _draw_panel(
 
 
 def _handle(k: int, line: _Line) -> Line2D:
-    """Return the legend's handle of the line at a place."""
     look = style.style(k)
     return Line2D(
         [], [], color=look.color, ls=look.line, marker=look.marker, mec="white", label=style.plain(line.label)
@@ -268,7 +267,6 @@ def _environment_options(entry: EntryResults) -> Mapping[str, Any]:
 
 
 def _size(entry: EntryResults, by: str) -> float:
-    """Return the size of an entry: a number, or the length of a list."""
     if by == "parameters":
         return float(sum(entry.parameters))
     side, dot, name = by.partition(".")

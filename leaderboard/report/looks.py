@@ -141,7 +141,6 @@ def _picture(outcome: State) -> dict[str, Any]:
 
 
 def _minute(when: str) -> str:
-    """Write a time of the log to the minute."""
     try:
         return f"{datetime.datetime.fromisoformat(when).astimezone(datetime.UTC):%Y-%m-%d %H:%M} UTC"
     except ValueError:

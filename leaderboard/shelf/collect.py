@@ -378,7 +378,6 @@ def _stores(selection: Selection, of_studies: bool = False) -> list[EntryStore]:
 
 
 def _task(store: EntryStore) -> str:
-    """Return the name of the folder of an entry's task."""
     return store.path.parent.name
 
 

@@ -377,7 +377,6 @@ def _write(
     points: Mapping[Run, Points],
     early: str | None,
 ) -> Imported:
-    """Write the seeds of an entry that are not there yet."""
     require_no_link(store.path.parent, store.path)
     if (store.path / "entry.json").exists():
         before = store.record().maximum

@@ -268,7 +268,6 @@ def _arguments(indices: Sequence[int | float], rows: Sequence[Tensor]) -> list[T
 
 
 def _apply(operation: Operation, angles: list[Any]) -> None:
-    """Queue one gate."""
     gate, wires, control = operation.gate, list(operation.wires), operation.control
     factory = GATES.get((gate, control is not None))
     if control is None:

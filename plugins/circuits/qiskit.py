@@ -331,7 +331,6 @@ def _needs_shots(options: QiskitOptions, qubits: int, setting: str) -> None:
 
 
 def _fake_backend(name: str, qubits: int, option: str = "noise_model") -> Any:
-    """Return a snapshot of a device by the name of its class."""
     if name == "GenericBackendV2":
         from qiskit.providers.fake_provider import GenericBackendV2
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import EnvironmentSpec, PictureSpec
@@ -68,39 +69,21 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
         )
     )
     register(
-        EnvironmentSpec(
-            name="room",
-            summary="Room: find the goal in a walled room, seen as an image",
-            options=f"{_HERE}.room:RoomOptions",
-            gymnasium_id="qrlsuite/Room-v1",
-            entry_point=f"{_HERE}.room:Room",
-            vector=f"{_HERE}.room:RoomLanes",
-            policies={"shortest way": f"{_HERE}.room:ShortestWay"},
+        _in_lanes(
+            f"{_HERE}.room:Room",
+            "Room: find the goal in a walled room, seen as an image",
+            {"shortest way": "ShortestWay"},
             views=("view", "sight"),
         )
     )
     register(
-        EnvironmentSpec(
-            name="cartpole",
-            summary="CartPole-v1: balance a pole on a cart; 500 steps at most",
-            options=f"{_HERE}.cartpole:CartPoleOptions",
-            gymnasium_id="qrlsuite/CartPole-v1",
-            entry_point=f"{_HERE}.cartpole:CartPole",
-            vector=f"{_HERE}.cartpole:CartPoleLanes",
-        )
+        _in_lanes(f"{_HERE}.cartpole:CartPole", "CartPole-v1: balance a pole on a cart; 500 steps at most")
     )
     register(
-        EnvironmentSpec(
-            name="pong",
-            summary="Pong: play against an opponent that follows the ball",
-            options=f"{_HERE}.pong:PongOptions",
-            gymnasium_id="qrlsuite/Pong-v1",
-            entry_point=f"{_HERE}.pong:Pong",
-            vector=f"{_HERE}.pong:PongLanes",
-            policies={
-                "steep returns": f"{_HERE}.pong:SteepReturns",
-                "follows the ball": f"{_HERE}.pong:Follower",
-            },
+        _in_lanes(
+            f"{_HERE}.pong:Pong",
+            "Pong: play against an opponent that follows the ball",
+            {"steep returns": "SteepReturns", "follows the ball": "Follower"},
         )
     )
     register(
@@ -113,57 +96,35 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
         )
     )
     register(
-        EnvironmentSpec(
-            name="pulse",
-            summary="Pulse: bring one or two qubits into a state by fields",
-            options=f"{_QUANTUM}.pulse:PulseOptions",
-            gymnasium_id="qrlsuite/Pulse-v1",
-            entry_point=f"{_QUANTUM}.pulse:Pulse",
-            vector=f"{_QUANTUM}.pulse:PulseLanes",
+        _in_lanes(
+            f"{_QUANTUM}.pulse:Pulse",
+            "Pulse: bring one or two qubits into a state by fields",
+            {"best pulse": "BestPulse", "greedy": "GreedyPulse"},
             pictures=(_EPISODE,),
-            policies={"best pulse": f"{_QUANTUM}.pulse:BestPulse", "greedy": f"{_QUANTUM}.pulse:GreedyPulse"},
         )
     )
     register(
-        EnvironmentSpec(
-            name="clifford",
-            summary="Clifford: write a Clifford operation as a circuit of few gates",
-            options=f"{_QUANTUM}.clifford:CliffordOptions",
-            gymnasium_id="qrlsuite/Clifford-v1",
-            entry_point=f"{_QUANTUM}.clifford:Clifford",
-            vector=f"{_QUANTUM}.clifford:CliffordLanes",
+        _in_lanes(
+            f"{_QUANTUM}.clifford:Clifford",
+            "Clifford: write a Clifford operation as a circuit of few gates",
+            {"shortest circuit": "ShortestCircuit", "greedy": "GreedyCircuit"},
             pictures=(_EPISODE,),
-            policies={
-                "shortest circuit": f"{_QUANTUM}.clifford:ShortestCircuit",
-                "greedy": f"{_QUANTUM}.clifford:GreedyCircuit",
-            },
         )
     )
     register(
-        EnvironmentSpec(
-            name="vqe",
-            summary="VQE: grow a circuit whose state has a low energy",
-            options=f"{_QUANTUM}.vqe:VQEOptions",
-            gymnasium_id="qrlsuite/VQE-v1",
-            entry_point=f"{_QUANTUM}.vqe:VQE",
-            vector=f"{_QUANTUM}.vqe:VQELanes",
+        _in_lanes(
+            f"{_QUANTUM}.vqe:VQE",
+            "VQE: grow a circuit whose state has a low energy",
+            {"best circuit": "BestCircuit", "greedy": "GreedyGate"},
             pictures=(_EPISODE,),
-            policies={"best circuit": f"{_QUANTUM}.vqe:BestCircuit", "greedy": f"{_QUANTUM}.vqe:GreedyGate"},
         )
     )
     register(
-        EnvironmentSpec(
-            name="channel",
-            summary="Channel: find out by experiments which error a qubit suffers",
-            options=f"{_QUANTUM}.channel:ChannelOptions",
-            gymnasium_id="qrlsuite/Channel-v1",
-            entry_point=f"{_QUANTUM}.channel:Channel",
-            vector=f"{_QUANTUM}.channel:ChannelLanes",
+        _in_lanes(
+            f"{_QUANTUM}.channel:Channel",
+            "Channel: find out by experiments which error a qubit suffers",
+            {"most informative": "Informative", "in turn": "InTurn"},
             pictures=(_EPISODE,),
-            policies={
-                "most informative": f"{_QUANTUM}.channel:Informative",
-                "in turn": f"{_QUANTUM}.channel:InTurn",
-            },
         )
     )
     register(
@@ -174,4 +135,21 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="CartPole-v1",
             vector=f"{_HERE}.gym:make_vector",
         )
+    )
+
+
+def _in_lanes(
+    entry_point: str, summary: str, policies: Mapping[str, str] | None = None, **more: Any
+) -> EnvironmentSpec:
+    """Return the spec of an environment `MODULE:NAME` with `NAMEOptions` and `NAMELanes` in its module."""
+    module, name = entry_point.split(":")
+    return EnvironmentSpec(
+        name=name.lower(),
+        summary=summary,
+        options=f"{entry_point}Options",
+        gymnasium_id=f"qrlsuite/{name}-v1",
+        entry_point=entry_point,
+        vector=f"{entry_point}Lanes",
+        policies={called: f"{module}:{policy}" for called, policy in (policies or {}).items()},
+        **more,
     )

@@ -114,14 +114,7 @@ class CartPole(CartPoleEnv):
     The episode is *terminated* when the pole leans by more than 12 degrees or the cart leaves [-2.4, 2.4], and
     *truncated* after `steps` steps: an agent that learns from the following state's value must still use it.
 
-    ## Arguments
-
-    | Argument        | Default               | Meaning                                                |
-    |-----------------|-----------------------|--------------------------------------------------------|
-    | `steps`         | 500                   | time limit                                             |
-    | `normalization` | "none"                | "none", "bounds", "arctan"; in tasks also "running"    |
-    | `bounds`        | (2.4, 2.5, 0.21, 2.5) | what becomes 1 with "bounds"                           |
-    | `render_mode`   | None                  | "rgb_array" or "human", which need pygame              |
+    Arguments are the fields of `CartPoleOptions`; render modes "rgb_array" and "human" need pygame.
     """
 
     def __init__(

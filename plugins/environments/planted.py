@@ -85,11 +85,7 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
 
     The episode is *terminated* after `steps` steps; `info["score"]` is then the share of right answers.
 
-    ## Arguments
-
-    | Argument | Default | Meaning             |
-    |----------|---------|---------------------|
-    | `steps`  | 20      | steps of an episode |
+    Arguments are the fields of `PlantedOptions`.
     """
 
     points: NDArray[np.float32]

@@ -52,7 +52,6 @@ def _source(environment: str) -> str:
 
 
 def _task(name: str) -> dict[str, Any]:
-    """Return a task's hash and file."""
     task = load(name)
     left_out = {
         preset: {

@@ -113,7 +113,6 @@ def plugin_words(entry: Entry) -> list[str]:
 
 
 def _roots(role: str, each: registry.Registered[specs.NumericSpec]) -> list[str]:
-    """Return the modules that a registered thing refers to."""
     references = [getattr(each.spec, name) for name in _CODE[role]]
     return [reference.partition(":")[0] for reference in references if reference is not None]
 

@@ -201,7 +201,6 @@ def mentions(entry: Named, word: str) -> bool:
 
 
 def _short(entry: Named) -> str:
-    """Return the label without the algorithm."""
     return entry.label.partition(" ")[2] or entry.label
 
 

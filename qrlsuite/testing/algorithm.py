@@ -95,7 +95,6 @@ def _check(subject: Subject, world: World) -> list[Finding]:
 
 
 def _works(trial: Trial) -> None:
-    """Check some epochs."""
     for rule in (_trains, _acts, _learns):
         rule(trial)
 

@@ -81,7 +81,6 @@ def check(subject: Subject) -> list[Finding]:
 
 
 def _works(lanes: Lanes) -> None:
-    """Check some steps."""
     lanes.make([0])  # a value may be refused in words
     _shapes(lanes)
 

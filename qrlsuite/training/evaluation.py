@@ -317,7 +317,6 @@ def references(
 
 
 def _random(envs: LaneEnv, stream: np.random.Generator) -> Policy:
-    """Return the policy that draws from the action space."""
     return lambda observations: draw(envs.single_action_space, stream, envs.num_envs)
 
 

@@ -33,7 +33,6 @@ class Interruptible:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Restore the earlier handlers."""
         for number, handler in self._old.items():
             signal.signal(number, handler)
 

@@ -284,7 +284,6 @@ def _rule(op: Any) -> Rule | None:
 
 
 def _runs(op: Any) -> bool:
-    """Return whether a gate runs without decomposition."""
     if _rule(op) is not None:
         return True
     if len(op.wires) > MATRIX_WIRES or not op.has_matrix:

@@ -84,15 +84,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
     )
     ```
 
-    | Argument      | Default    | Meaning                                                                  |
-    |---------------|------------|--------------------------------------------------------------------------|
-    | `antennas`    | 3 antennas | positions (x, y) and orientations (d_x, d_y) of two or more antennas     |
-    | `degree`      | 3          | support points of a path, 2 to 32                                        |
-    | `steps`       | 200        | actions per episode                                                      |
-    | `physics`     | "released" | "released": intensity falls with R^4; "text": with R^2, other codebook   |
-    | `rejection`   | "tolerant" | "released" reproduces a rounding error that rejects valid paths          |
-    | `stack`       | 1          | number of last observations that make one                                |
-    | `render_mode` | None       | "rgb_array", "ansi" or "human", which needs pygame                       |
+    Arguments are the fields of `BeamOptions`; render modes are "rgb_array", "ansi" and "human", which needs pygame.
 
     ## Version History
 

@@ -79,7 +79,6 @@ def pulse(
 
 
 def _sphere(axes: Any) -> None:
-    """Draw an empty Bloch sphere."""
     angle = np.linspace(0, 2 * np.pi, 73)
     zero, cos, sin = np.zeros_like(angle), np.cos(angle), np.sin(angle)
     for circle in ((cos, sin, zero), (cos, zero, sin), (zero, cos, sin)):

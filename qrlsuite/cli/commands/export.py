@@ -100,7 +100,6 @@ def shortfalls(entry: EntryResults) -> Iterator[str]:
 
 
 def _rliable(file: Path, tasks: list[str], names: list[str], runs: Path, json_output: bool) -> None:
-    """Write rliable's arrays."""
     shares = export_rliable(file, tasks, names, runs)
     arrays = shares.rliable()
     if json_output:
