@@ -16,12 +16,12 @@ from torch import Tensor
 from qrlsuite.compiled import networks, vectors
 
 SPARE_BYTES = 64 << 20
-"""Working memory up to this size is kept from one pass to the next: fresh pages cost more time than a small network."""
+"""Working memory up to this size is kept for a later pass, as much as passes at a time took: fresh pages cost time."""
 
 WIDE = 2 * vectors.lanes(np.float32)
 """Samples of a chunk."""
 
-_spare: dict[tuple[str, int, int], Any] = {}
+_spare: dict[tuple[str, int, int], list[Any]] = {}
 
 Array = NDArray[np.float32]
 _NOTHING: Array = np.empty(1, np.float32)
@@ -304,15 +304,17 @@ class Records:
     """Memory (n, rows, wide) of a pass, such as a chunk's values in every layer; it then serves another pass."""
 
     def __init__(self, purpose: str, number: int, rows: int, wide: int) -> None:
-        self.key = purpose, rows, wide
-        room = _spare.pop(self.key, None)
+        self.spare = _spare.setdefault((purpose, rows, wide), [])
+        room = self.spare.pop() if self.spare else None
         if room is None or len(room) < number:
             room = vectors.aligned((number, rows, wide), np.float32)
         self.array = room
 
-    def __del__(self, spare: dict[tuple[str, int, int], Any] = _spare, most: int = SPARE_BYTES) -> None:
-        if self.array.nbytes <= most:  # names of the module may be gone when the interpreter ends
-            spare[self.key] = self.array
+    def __del__(
+        self, most: int = SPARE_BYTES
+    ) -> None:  # names of the module may be gone when the interpreter ends
+        if self.array.nbytes <= most:
+            self.spare.append(self.array)
 
 
 class _Swept(torch.autograd.Function):

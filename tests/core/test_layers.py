@@ -307,9 +307,9 @@ def test_a_moved_or_changed_parameter_is_seen() -> None:
 def test_records_are_used_again() -> None:
     parameters, x = network((3, 24, 3), 2), torch.randn(2, 64, 3)
     passes(parameters, x, torch.ones(2, 64, 3), "relu")
-    kept = {key: array.ctypes.data for key, array in perceptron._spare.items()}
+    kept = {key: [each.ctypes.data for each in rooms] for key, rooms in perceptron._spare.items()}
     passes(parameters, x, torch.ones(2, 64, 3), "relu")
-    assert {key: array.ctypes.data for key, array in perceptron._spare.items()} == kept
+    assert {key: [each.ctypes.data for each in rooms] for key, rooms in perceptron._spare.items()} == kept
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -15,11 +15,12 @@ def _on_grid(pieces: Any, b: int, borders: Any, starts: Any, grid: Any, out: Any
     last = pieces.shape[1] - 1
     for piece in range(pieces.shape[0]):
         first, end, border = starts[piece], starts[piece + 1], borders[piece]
-        out[first:end] = pieces[piece, last, b]
+        values, places = out[first:end], grid[first:end]  # of slices, loops have no index below 0
+        values[:] = pieces[piece, last, b]
         for j in range(last - 1, -1, -1):
             coefficient = pieces[piece, j, b]
-            for i in range(first, end):
-                out[i] = out[i] * (grid[i] - border) + coefficient
+            for i in range(end - first):
+                values[i] = values[i] * (places[i] - border) + coefficient
 
 
 @rounded
@@ -78,9 +79,6 @@ def walk(
         _on_grid(slope_y, b, borders, starts, grid, other)
         for i in range(grid.shape[0]):
             speed[i] = np.sqrt(speed[i] * speed[i] + other[i] * other[i])
-        slowest = speed[0]
-        for i in range(1, grid.shape[0]):
-            slowest = min(slowest, speed[i])
         for p in range(panels):
             whole = 7.0 * (speed[4 * p] + speed[4 * p + 4])
             whole += 32.0 * (speed[4 * p + 1] + speed[4 * p + 3])
@@ -88,7 +86,10 @@ def walk(
         for p in range(panels):
             before[p + 1] = before[p] + length[p]
         total = before[panels]
-        slow[b] = slowest < limit * total
+        below = 0  # counted, for a minimum is found one by one
+        for i in range(grid.shape[0]):
+            below += speed[i] < limit * total
+        slow[b] = below > 0
 
         # Step k lies in the panel whose number is that of the interior borders at or before its arc length.
         counts[:] = 0
@@ -101,11 +102,13 @@ def walk(
             now += counts[k]
             panel[k] = now
             target[k] = total * shares[k] - before[now]
-            z[k] = target[k] / length[now]
-            a0, a1, a2, a3 = speed[4 * now], speed[4 * now + 1], speed[4 * now + 2], speed[4 * now + 3]
-            a4 = speed[4 * now + 4]
+            z[k] = length[now]
+            v0[k], c1[k], c2[k] = speed[4 * now], speed[4 * now + 1], speed[4 * now + 2]
+            c3[k], c4[k] = speed[4 * now + 3], speed[4 * now + 4]
+        for k in range(steps + 1):
+            z[k] = target[k] / z[k]
+            a0, a1, a2, a3, a4 = v0[k], c1[k], c2[k], c3[k], c4[k]
             # The quartic through the five speeds, as powers of z in [0, 1] across the panel.
-            v0[k] = a0
             c1[k] = (-25.0 * a0 + 48.0 * a1 - 36.0 * a2 + 16.0 * a3 - 3.0 * a4) / 3.0
             c2[k] = (70.0 * a0 - 208.0 * a1 + 228.0 * a2 - 112.0 * a3 + 22.0 * a4) / 3.0
             c3[k] = (-80.0 * a0 + 288.0 * a1 - 384.0 * a2 + 224.0 * a3 - 48.0 * a4) / 3.0
@@ -196,18 +199,20 @@ def aim(
     """
     for b in range(x.shape[0]):
         for a in range(antennas.shape[0]):
-            piece = 0  # that of the last step, which is near
+            half, squared, beams = halves[b, a], r2[b, a], beam[lanes[b], a]
             for k in range(x.shape[1]):
                 dx, dy = x[b, k] - antennas[a, 0], y[b, k] - antennas[a, 1]
-                square = dx * dx + dy * dy + 1.0
-                u = (dx * antennas[a, 2] + dy * antennas[a, 3]) / np.sqrt(square) * np.pi
+                squared[k] = dx * dx + dy * dy + 1.0
+                half[k] = (dx * antennas[a, 2] + dy * antennas[a, 3]) / np.sqrt(squared[k]) * np.pi
+            piece = 0  # that of the last step, which is near
+            for k in range(x.shape[1]):
+                u = half[k]
                 while piece < borders.shape[0] and borders[piece] <= u:
                     piece += 1
                 while piece > 0 and borders[piece - 1] > u:
                     piece -= 1
-                chosen = best[piece]
-                halves[b, a, k], r2[b, a, k] = (u - phases[chosen]) * 0.5, square
-                beam[lanes[b], a, k] = chosen
+                beams[k] = best[piece]
+                half[k] = (u - phases[best[piece]]) * 0.5
 
 
 @rounded

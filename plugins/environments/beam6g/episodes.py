@@ -84,23 +84,17 @@ class EpisodeGenerator:
         from qrlsuite.plugins.environments.beam6g import compiled
 
         own, antennas = self.physics, np.array(self.options.antennas).reshape(-1, 4)
+        room = np.empty((4, min(len(lanes), _BLOCK), len(antennas), self.options.steps + 1))
         for first in range(0, len(lanes), _BLOCK):
             rows = lanes[first : first + _BLOCK]
+            halves, r2, below, above = room[:, : len(rows)]
             x, y = trajectory.positions(support[first : first + _BLOCK], self.options.steps)
-            halves, r2 = np.empty((2, len(rows), len(antennas), self.options.steps + 1))
             compiled.aim(x, y, antennas, own.steps, own.best, own.phases, rows, halves, r2, tables.beam)
-            below, above = np.sin(halves), np.sin(halves * SENDERS)  # numpy's, whose bits numba's need not be
+            np.sin(halves, out=below)  # numpy's, whose bits numba's need not be
+            np.sin(np.multiply(halves, SENDERS, out=halves), out=above)
             compiled.tabulate(
-                below,
-                above,
-                r2,
-                float(SENDERS),
-                own.fourth_power,
-                own.peak,
-                rows,
-                tables.intensity,
-                tables.optimal,
-            )
+                below, above, r2, float(SENDERS), own.fourth_power, own.peak, rows, tables.intensity, tables.optimal
+            )  # fmt: skip
 
     def observation(
         self, antenna: NDArray[np.int64], intensity: FloatArray, beam: BeamArray
