@@ -291,15 +291,11 @@ def _by_horizon(
     if requested is not None:
         return groups
     short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
-    lengths = sorted({_length(entry) for entry in short}, reverse=True)
+    lengths = sorted({entry.curves.shape[1] * entry.steps_per_epoch for entry in short}, reverse=True)
     for steps in lengths:
         reached = [entry.reaching(steps // entry.steps_per_epoch) for entry in short]
         groups.append((steps, True, [entry for entry in reached if entry is not None]))
     return groups
-
-
-def _length(entry: EntryResults) -> int:
-    return int(entry.curves.shape[1]) * entry.steps_per_epoch
 
 
 def _section(

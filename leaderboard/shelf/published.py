@@ -126,7 +126,7 @@ class PublishedEntry:
         if stated is None:
             return {}
         stacked = read_arrays(path, MAX_BYTES)
-        if _sha256(path) != stated.sha256:
+        if hashlib.sha256(read_bytes(path)).hexdigest() != stated.sha256:
             raise StoreError(
                 f"{path} is not the file whose hash is in entry.json: restore it, or export the entry again"
             )
@@ -355,10 +355,6 @@ def _check_agents(folder: Path, stated: AgentsRecord | None, seeds: Sequence[int
         folder,
         f"{AGENTS} is missing; write the entry again with `qrlsuite export`",
     )
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def _require(holds: bool, folder: Path, problem: str) -> None:

@@ -83,7 +83,7 @@ class QiskitBackend:
             self._executed = QuantumCircuit(circuit.qubits, len(self._measured))
             self._executed.compose(self._circuit, inplace=True)
             self._executed.measure(self._measured, range(len(self._measured)))
-        if _is_fake(options):
+        if options.noise_model not in (None, "depolarizing"):  # a fake device
             self._executed = transpile(
                 self._executed, self._simulator, seed_transpiler=0, optimization_level=1
             )
@@ -290,10 +290,6 @@ def _device(name: str, qubits: int) -> Any:
     if fake_device(name):
         return _fake_backend(name, qubits, "device")
     return open_device(name)
-
-
-def _is_fake(options: QiskitOptions) -> bool:
-    return options.noise_model not in (None, "depolarizing")
 
 
 def _simulator(options: QiskitOptions, qubits: int) -> Any:

@@ -142,12 +142,12 @@ class UnitPopulation(StackedPopulation):
 
     def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
         """Return outputs (S, B, out), and with a state the next one."""
-        layers = self._modules
-        return self.compute(lambda name, inner: _of_all(layers[name], inner), x, state, self.options)
 
+        def layer(name: str, inner: Tensor) -> Tensor:
+            own: Any = self._modules[name]
+            return linear(inner, own.weight, own.bias)
 
-def _of_all(layer: Any, x: Tensor) -> Tensor:
-    return linear(x, layer.weight, layer.bias)
+        return self.compute(layer, x, state, self.options)
 
 
 def gru(obs_dim: int, out_dim: int, options: RecurrentOptions, generator: torch.Generator) -> GRU:

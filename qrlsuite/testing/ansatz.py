@@ -197,14 +197,9 @@ def _light_cone(build: Any, options: Any, circuits: Circuits) -> str:
     )
 
 
-def _smallest(circuits: Circuits) -> Circuit:
-    """Return the two-qubit circuit with two layers, or the nearest to it that exists."""
-    return circuits[min(circuits, key=lambda size: (abs(size[0] - 2), abs(size[1] - 2)))]
-
-
 def _backends(circuits: Circuits) -> None:
-    """Require that installed backends agree on a small circuit, as far as they are exact."""
-    circuit = _smallest(circuits)
+    """Require that installed backends agree on a circuit of two qubits and layers or so, as far as they are exact."""
+    circuit = circuits[min(circuits, key=lambda size: (abs(size[0] - 2), abs(size[1] - 2)))]
     for name, each in registry.load().of(specs.CircuitBackendSpec).items():
         if circuit.mean_field and not each.spec.mean_field:
             continue

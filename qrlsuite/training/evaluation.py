@@ -309,15 +309,12 @@ def references(
         streams = Streams(entry.task.hash, seed)
 
         def uniform(envs: LaneEnv, block: int) -> Policy:
-            return _random(envs, streams.numpy("evaluation random", block))
+            stream = streams.numpy("evaluation random", block)
+            return lambda observations: draw(envs.single_action_space, stream, envs.num_envs)
 
         returns, scores, _ = play(entry, 1, episodes, seed, uniform, "random", report)
         played.append(Played("random", returns, scores))
     return played
-
-
-def _random(envs: LaneEnv, stream: np.random.Generator) -> Policy:
-    return lambda observations: draw(envs.single_action_space, stream, envs.num_envs)
 
 
 def _checked(name: str, policy: Policy, envs: LaneEnv) -> Policy:
