@@ -22,6 +22,9 @@ from qrlsuite.statistics.permutation import CHUNK, relabelings, relabelings_for
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
 from qrlsuite.statistics.times_board import holm, log_ratios
 
+DRAWN = 8
+"""Tasks from which a mean over further tasks is stated, as if these were drawn at random."""
+
 Scores = Mapping[str, Sequence[ArrayLike] | NDArray[np.floating]]
 """For each entry K arrays (runs,), one per task, or rliable's array (runs, tasks)."""
 
@@ -255,6 +258,9 @@ class MeanRatio:
         Two-sided, of no mean difference.
     left_out:
         Least and greatest `difference` when one of the tasks is left out.
+    drawn_interval, drawn_p:
+        As `interval` and `p`, of the mean over all tasks of which these K were drawn at random: each task's log ratio
+        is one observation of Student's t test. NaN below `DRAWN` tasks.
     """
 
     differences: tuple[float, ...]
@@ -262,6 +268,8 @@ class MeanRatio:
     interval: tuple[float, float]
     p: float
     left_out: tuple[float, float]
+    drawn_interval: tuple[float, float]
+    drawn_p: float
 
 
 def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) -> MeanRatio:
@@ -303,12 +311,16 @@ def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) 
     mean, error = ratios.mean(), math.sqrt(variance) / len(pairs)
     reach = error * float(student_quantile((1 + level) / 2, freedom))
     others = (ratios.sum() - ratios) / (len(ratios) - 1)
+    among = float(ratios.std(ddof=1)) / math.sqrt(len(pairs)) if len(pairs) >= DRAWN else math.nan
+    among_reach = among * float(student_quantile((1 + level) / 2, len(pairs) - 1))
     return MeanRatio(
         tuple(np.expm1(ratios).tolist()),
         math.expm1(mean),
         (math.expm1(mean - reach), math.expm1(mean + reach)),
         _two_sided(mean, error, freedom),
         (math.expm1(others.min()), math.expm1(others.max())),
+        (math.expm1(mean - among_reach), math.expm1(mean + among_reach)),
+        _two_sided(mean, among, len(pairs) - 1),
     )
 
 

@@ -6,6 +6,7 @@ first look count here: every pair has them, whatever they showed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed
 from qrlsuite.results.text import interval_text, p_text, percent
 from qrlsuite.statistics import MeanRatio, mean_ratio, times_below
+from qrlsuite.statistics.across import DRAWN
 from qrlsuite.statistics.grid import IntArray
 from qrlsuite.statistics.times_board import holm
 from qrlsuite.studies.state import State, by_question
@@ -37,7 +39,8 @@ class SharedPair:
     question:
         The question that it answers in the first study; may be empty.
     ratio:
-        How many more steps the second entry needs, on each task and on average; p is adjusted for all pairs (Holm).
+        How many more steps the second entry needs, on each task and on average; each p is adjusted for all pairs
+        (Holm).
     """
 
     question: str
@@ -46,9 +49,16 @@ class SharedPair:
     ratio: MeanRatio
 
     @property
+    def judged(self) -> tuple[float, tuple[float, float]]:
+        """The p and the interval of the verdict: over the given tasks, or where they are many, over such tasks."""
+        ratio = self.ratio
+        few = math.isnan(ratio.drawn_p)
+        return (ratio.p, ratio.interval) if few else (ratio.drawn_p, ratio.drawn_interval)
+
+    @property
     def verdict(self) -> str:
         """Which entry needs fewer steps on average over the tasks, if that is significant."""
-        if self.ratio.p > ALPHA:
+        if self.judged[0] > ALPHA:
             return "not told apart"
         return f"{self.first if self.ratio.difference > 0 else self.second} needs fewer"
 
@@ -97,6 +107,9 @@ class StudiesTogether(Shown):
         def mean(pair: SharedPair) -> str:
             return interval_text(percent, pair.ratio.difference, *pair.ratio.interval)
 
+        def drawn(pair: SharedPair) -> str:
+            return interval_text(percent, pair.ratio.difference, *pair.ratio.drawn_interval)
+
         def on(place: int, task: str) -> Column[SharedPair]:
             return Column("", lambda pair: pair.ratio.differences[place], percent, head=task)
 
@@ -109,6 +122,18 @@ class StudiesTogether(Shown):
             Column("difference", lambda pair: pair.ratio.difference, head="mean (95%)", cell=mean),
             Column("interval", lambda pair: list(pair.ratio.interval)),
             Column("p", lambda pair: pair.ratio.p, p_text),
+            *(
+                (
+                    Column(
+                        "drawn_interval",
+                        lambda pair: list(pair.ratio.drawn_interval),
+                        head="over such tasks (95%)",
+                        cell=drawn,
+                    ),
+                    Column("drawn_p", lambda pair: pair.ratio.drawn_p, p_text, head="p over such tasks"),
+                )
+                * (len(self.studies) >= DRAWN)
+            ),
             Column("left_out", lambda pair: list(pair.ratio.left_out), _span, head="one left out"),
             Column("differences", lambda pair: dict(zip(self.tasks, pair.ratio.differences))),
             *(on(place, task) for place, task in enumerate(self.tasks)),
@@ -138,7 +163,11 @@ class StudiesTogether(Shown):
             f"({', '.join(map(str, self.seeds))}), which no early stop can bias; mean: of the ratios, over these "
             f"{len(self.tasks)} tasks, with a 95% interval by itself; one left out: the least and the greatest mean "
             f"without one of the tasks; verdict: error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). "
-            "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
+            + (
+                "Over such tasks: as if these were drawn at random from many; the verdict is about those."
+                if len(self.studies) >= DRAWN
+                else "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
+            )
         )
         yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
@@ -180,10 +209,12 @@ def together(studies: Sequence[State]) -> StudiesTogether:
             left_out.append(f"{first} / {second}: {error}")
         else:
             ratios.append((asked, first, second, ratio))
-    adjusted = holm(np.array([ratio.p for *_, ratio in ratios])).tolist()
+    adjusted, drawn = (
+        holm(np.array([getattr(ratio, name) for *_, ratio in ratios])).tolist() for name in ("p", "drawn_p")
+    )
     found = tuple(
-        SharedPair(asked, first, second, replace(ratio, p=p))
-        for (asked, first, second, ratio), p in zip(ratios, adjusted)
+        SharedPair(asked, first, second, replace(ratio, p=p, drawn_p=other))
+        for (asked, first, second, ratio), p, other in zip(ratios, adjusted, drawn)
     )
     return StudiesTogether(tuple(studies), found, tuple(left_out))
 

@@ -9,10 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_1samp
 
 from qrlsuite import api
 from qrlsuite.leaderboard.pictures import outcome as drawing
+from qrlsuite.statistics import across
 from qrlsuite.statistics.sequential import Decided
+from qrlsuite.statistics.times_board import holm
+from qrlsuite.studies import together as studies_together
 from qrlsuite.studies.together import StudiesTogether, together
 from tests.commands import answer, say
 from tests.leaderboard.boards import refused
@@ -84,7 +88,7 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
             for pair in study.pairs
             if (pair.first, pair.second) == (shared.first, shared.second)
         ]
-        for row, interval in enumerate((*own, shared.ratio.interval), start=place * size + 1):
+        for row, interval in enumerate((*own, shared.judged[1]), start=place * size + 1):
             assert lines[row].get_xdata() == pytest.approx([1 + end for end in interval])
     pair = next(each for each in read.studies[0].pairs if each.decided is Decided.FIRST)
     turned = drawing._reversed(pair)
@@ -94,6 +98,22 @@ def test_pairs_that_several_studies_share_are_drawn_task_by_task(tmp_path: Path)
     assert [turned.difference, *turned.interval] == pytest.approx(ratios)
     unbounded = drawing._reversed(replace(pair, interval=(-1.0, math.inf)))
     assert unbounded.interval == (-1.0, math.inf)
+
+
+def test_the_mean_of_many_tasks_is_that_of_tasks_like_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (across, studies_together):
+        monkeypatch.setattr(module, "DRAWN", len(TOGETHER))
+    read = api.read_study(*TOGETHER)
+    assert isinstance(read, StudiesTogether)
+    drawn = [ttest_1samp(np.log1p(pair.ratio.differences), 0).pvalue for pair in read.pairs]
+    assert [pair.ratio.drawn_p for pair in read.pairs] == pytest.approx(holm(drawn).tolist())
+    for pair in read.pairs:
+        assert (pair.verdict == "not told apart") == (pair.ratio.drawn_p > 0.05)
+    lines = [line.get_xdata() for line in drawing.draw_together(read).axes[0].lines]
+    low, high = read.pairs[0].ratio.drawn_interval
+    assert any(len(ends) == 2 and ends == pytest.approx([1 + low, 1 + high]) for ends in lines)
+    assert "the verdict is about those" in " ".join(repr(read).split())
+    assert read.as_dict()["pairs"][0]["drawn_interval"] == list(read.pairs[0].ratio.drawn_interval)
 
 
 def test_a_pair_without_a_ratio_is_left_out_alone() -> None:
