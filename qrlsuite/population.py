@@ -653,17 +653,8 @@ class Adam:
         else:
             scale, roots[:] = np.array([_corrections(*self.betas, max(count, 1)) for count in counts]).T
         moved = everyone if active is None else active.cpu().numpy()
-        move(
-            block,
-            gradients,
-            means,
-            squares,
-            sizes,
-            (rates * scale).astype(np.float32),
-            roots,
-            moved,
-            *constants,
-        )
+        corrected = (rates * scale).astype(np.float32)
+        move(block, gradients, means, squares, sizes, corrected, roots, moved, *constants)
         return True
 
     def _lay_out(self, parameters: Sequence[Tensor]) -> tuple[Any, ...]:
@@ -678,11 +669,8 @@ class Adam:
         for part in (parameters, *moments):
             in_one_block(part)
         agents = len(self.steps)
-        rates, roots, everyone = (
-            np.empty((len(parameters), agents)),
-            np.empty(agents, np.float32),
-            np.ones(agents, bool),
-        )
+        rates, roots = np.empty((len(parameters), agents)), np.empty(agents, np.float32)
+        everyone = np.ones(agents, np.bool_)
         sizes = np.array([p[0].numel() for p in parameters])
         blocks = (joined(part) for part in (parameters, *moments))
         beta1, beta2 = self.betas

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qrlsuite.plugins.environments.beam6g import physics
+from qrlsuite.plugins.environments.beam6g import compiled, physics
 from tests.conftest import golden
 
 EPISODES = golden("beam6g")
@@ -117,3 +117,16 @@ def test_bits_do_not_depend_on_the_place_in_an_array(size, offset):
     intensity, beam = physics.best_intensity(model, x[part], y[part], MIDDLE)
     assert intensity.tobytes() == whole[part].tobytes()
     assert beam.tobytes() == beams[part].tobytes()
+
+
+@pytest.mark.parametrize("name", ["released", "text"])
+def test_compiled_tables_have_the_bits_of_the_physics(name: physics.Name) -> None:
+    """Also on a beam's peak, where the intensity is 1 / R^2, and next to it."""
+    model, half = physics.physics(name), np.array([[[0.0, 1e-6, 1e-4, 0.3]]])
+    r2, intensity, optimal = np.linspace(1.0, 4.0, 4)[None, None], np.empty((1, 1, 4)), np.empty(1)
+    compiled.tabulate(
+        np.sin(half), np.sin(half * physics.SENDERS), r2, float(physics.SENDERS), model.fourth_power, model.peak,
+        np.zeros(1, np.int64), intensity, optimal,
+    )  # fmt: skip
+    assert intensity.tobytes() == model.intensity(2 * half, r2, 0.0).tobytes()
+    assert optimal[0] == np.cumsum(intensity)[-1]

@@ -175,17 +175,8 @@ def serve(
 
 @rounded
 def aim(
-    x: Any,
-    y: Any,
-    antennas: Any,
-    borders: Any,
-    best: Any,
-    phases: Any,
-    lanes: Any,
-    halves: Any,
-    r2: Any,
-    beam: Any,
-) -> None:
+    x: Any, y: Any, antennas: Any, borders: Any, best: Any, phases: Any, lanes: Any, halves: Any, r2: Any, beam: Any
+) -> None:  # fmt: skip
     """Write how every antenna sees users at x, y (B, K + 1): half of xi, and R^2, (B, A, K + 1); see `physics`.
 
     Parameters
