@@ -230,7 +230,7 @@ def _mark(made: Path, mark: str, place: Path) -> None:
     with Image.open(made) as image:
         if place.suffix == ".gif":
             images = [each.convert("RGB") for each in ImageSequence.Iterator(image)][::2]
-            colors = images[-1].quantize(64, dither=Image.Dither.NONE)
+            colors = images[-1].quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
             first, *rest = (each.quantize(palette=colors, dither=Image.Dither.NONE) for each in images)
             comment = f"{MARK} {mark}".encode()
             shown = {"duration": 100, "loop": 0, "optimize": True}
