@@ -110,6 +110,16 @@ class StudiesTogether(Shown):
         def drawn(pair: SharedPair) -> str:
             return interval_text(percent, pair.ratio.difference, *pair.ratio.drawn_interval)
 
+        over_such: tuple[Column[SharedPair], ...] = (
+            Column(
+                "drawn_interval",
+                lambda pair: list(pair.ratio.drawn_interval),
+                head="over such tasks (95%)",
+                cell=drawn,
+            ),
+            Column("drawn_p", lambda pair: pair.ratio.drawn_p, p_text, head="p over such tasks"),
+        )
+
         def on(place: int, task: str) -> Column[SharedPair]:
             return Column("", lambda pair: pair.ratio.differences[place], percent, head=task)
 
@@ -122,18 +132,7 @@ class StudiesTogether(Shown):
             Column("difference", lambda pair: pair.ratio.difference, head="mean (95%)", cell=mean),
             Column("interval", lambda pair: list(pair.ratio.interval)),
             Column("p", lambda pair: pair.ratio.p, p_text),
-            *(
-                (
-                    Column(
-                        "drawn_interval",
-                        lambda pair: list(pair.ratio.drawn_interval),
-                        head="over such tasks (95%)",
-                        cell=drawn,
-                    ),
-                    Column("drawn_p", lambda pair: pair.ratio.drawn_p, p_text, head="p over such tasks"),
-                )
-                * (len(self.studies) >= DRAWN)
-            ),
+            *(over_such * (len(self.studies) >= DRAWN)),
             Column("left_out", lambda pair: list(pair.ratio.left_out), _span, head="one left out"),
             Column("differences", lambda pair: dict(zip(self.tasks, pair.ratio.differences))),
             *(on(place, task) for place, task in enumerate(self.tasks)),
