@@ -9,6 +9,7 @@ device; on CUDA devices their rounds are captured. No GPU has shown yet that the
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -110,6 +111,58 @@ class DeviceLanes:
     def actions(self) -> NDArray[np.int64]:
         """Return the actions of all steps since `begin`, (steps, L)."""
         return self.state["actions"].cpu().numpy()
+
+
+class EpisodesOnDevice(DeviceLanes):
+    """Plays lanes whose episodes end by what is done: a base for environments.
+
+    The state is the lanes' `state_dict`, with `step` and `ended`. A lane may begin an episode after every step, so as
+    many beginnings are drawn by lanes of the same kind, one for each, from copies of the streams.
+    """
+
+    def draw(self, steps: int) -> dict[str, Any]:
+        """Return the state, and the beginnings of `steps` episodes for each lane."""
+        lanes, count, drawn = self.lanes, self.lanes.num_envs, self.lanes.state_dict()
+        self._names = list(drawn)
+        if lanes.autoreset:
+            more = type(lanes)(lanes.options, count * steps)
+            more.seed_lanes(copy.deepcopy(lanes.streams))
+            more.reset()
+            drawn |= {
+                f"start.{n}": v.reshape(count, steps, *v.shape[1:]) for n, v in more.state_dict().items()
+            }
+        return {**drawn, "begun": np.zeros(count, np.int64), "lane": np.arange(count)}
+
+    def begin(self, steps: int, drawn: dict[str, Any] | None = None) -> None:
+        """Get ready for so many steps."""
+        super().begin(steps, drawn)
+        upload(self.state, self.device, observations=self._seen())
+
+    def act(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Take a step in every lane; without `autoreset`, ended lanes stay where they are."""
+        state, running = self.state, ~self.state["ended"]
+        state["step"] += running
+        rewards, ends = self._act(actions, running)
+        last = (state["step"] >= self.lanes.options.steps) & running
+        terminated = ends & running if getattr(self.lanes, "cut", True) else (ends & running) | last
+        done, arrived = terminated | last, self._seen()
+        state["ended"] |= done
+        if self.lanes.autoreset:
+            start = state["lane"], state["begun"].clamp(max=state["start.step"].shape[1] - 1)
+            for name in self._names:
+                now, shape = state[name], (-1, *[1] * (state[name].dim() - 1))
+                now.copy_(torch.where(done.view(shape), state[f"start.{name}"][start], now))
+            state["begun"] += done
+        state["observations"].copy_(self._seen())
+        return arrived, torch.where(running, rewards, 0.0), terminated
+
+    def _act(self, actions: Tensor, running: Tensor) -> tuple[Tensor, Tensor]:
+        """Change lanes that run, in place; return rewards, and whether episodes end before their last step."""
+        raise NotImplementedError
+
+    def _seen(self) -> Tensor:
+        """Return every lane's observation (L, n), a new tensor."""
+        raise NotImplementedError
 
 
 def upload(state: dict[str, Tensor], device: torch.device, /, **values: Any) -> None:

@@ -77,7 +77,11 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
         )
     )
     register(
-        _in_lanes(f"{_HERE}.cartpole:CartPole", "CartPole-v1: balance a pole on a cart; 500 steps at most")
+        _in_lanes(
+            f"{_HERE}.cartpole:CartPole",
+            "CartPole-v1: balance a pole on a cart; 500 steps at most",
+            device=f"{_HERE}.ondevice:CartPoleOnDevice",
+        )
     )
     register(
         _in_lanes(
@@ -108,6 +112,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             f"{_QUANTUM}.clifford:Clifford",
             "Clifford: write a Clifford operation as a circuit of few gates",
             {"shortest circuit": "ShortestCircuit", "greedy": "GreedyCircuit"},
+            device=f"{_HERE}.ondevice:CliffordOnDevice",
             pictures=(_EPISODE,),
         )
     )
@@ -124,6 +129,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             f"{_QUANTUM}.channel:Channel",
             "Channel: find out by experiments which error a qubit suffers",
             {"most informative": "Informative", "in turn": "InTurn"},
+            device=f"{_HERE}.ondevice:ChannelOnDevice",
             pictures=(_EPISODE,),
         )
     )

@@ -351,7 +351,8 @@ class DevicePlayer:
         self.lanes.begin(self.steps, drawn)
         self._rounds(self.steps)
         actions = iter(self.lanes.actions())
-        return play_episodes(self.envs, lambda: lambda observations: next(actions), first)
+        episodes = play_episodes(self.envs, lambda: lambda observations: next(actions), first)
+        return dataclasses.replace(episodes, rounds=self.steps)
 
     def _draw(self, epoch: int) -> tuple[Any, dict[str, Any]]:
         self.envs.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])

@@ -63,9 +63,10 @@ def test_an_update_reads_nothing_from_the_device(monkeypatch, model, decay_steps
     assert len(LateChecks._open._flags) == (model == "vqc-native")
 
 
-def test_a_round_reads_nothing_from_the_device():
+@pytest.mark.parametrize("name", ["beam6g", "cartpole", "clifford", "channel"])
+def test_a_round_reads_nothing_from_the_device(name):
     """A whole epoch of rounds; then the actions are read."""
-    spec, there = registry.get(specs.EnvironmentSpec, "beam6g"), torch.device("meta")
+    spec, there = registry.get(specs.EnvironmentSpec, name), torch.device("meta")
     envs = specs.resolve(spec.vector)(specs.resolve(spec.options)(), 4)
     group = Group("ddqn", [0, 1], envs, device="meta", buffer=5, target_steps=2).start()
     envs.on_device = specs.resolve(spec.device)(envs, there)
@@ -80,6 +81,9 @@ def test_a_round_reads_nothing_from_the_device():
     ("task", "model", "settings"),
     [
         ("beam6g", "mlp", {"buffer": 170, "target_steps": 90, "epsilon_steps": 3000}),
+        ("cartpole", "mlp", {"epsilon_steps": 300}),
+        ("clifford", "mlp", {"buffer": 1000}),
+        ("channel", "mlp", {"target_steps": 30}),
         ("beam6g-stack", "vqc-native", {"buffer": 2000, "decay_steps": 4000}),
     ],
 )
@@ -117,13 +121,13 @@ def test_epochs_on_a_device_have_the_same_bits_and_are_continued(monkeypatch, ta
         assert all(np.array_equal(found[name], value, equal_nan=True) for name, value in arrays.items())
 
 
-@pytest.mark.parametrize(("task", "algorithm"), [("cartpole", "ddqn"), ("beam6g", "ppo")])
+@pytest.mark.parametrize(("task", "algorithm"), [("pong", "ddqn"), ("beam6g", "ppo")])
 def test_what_takes_no_epochs_to_the_device_goes_on_as_ever_and_says_so(monkeypatch, task, algorithm):
     monkeypatch.setenv("QRLSUITE_CAPTURE", "1")
     trainer = Trainer(entries.resolve(task, "mlp", algorithm, [], None), [0])
     trainer.start()
     trainer.train_epoch()
-    part = "environment 'cartpole'" if algorithm == "ddqn" else "algorithm 'ppo'"
+    part = "environment 'pong'" if algorithm == "ddqn" else "algorithm 'ppo'"
     assert [each for each in trainer.progress.warnings if "QRLSUITE_CAPTURE" in each] == [
         f"QRLSUITE_CAPTURE=1 has no effect: {part} takes no whole epochs to the device"
     ]
