@@ -7,6 +7,14 @@ of the ranges; an option at half its range from there costs 22 percent in the mi
 nothing, and they interact (`Surface`). Far away it levels off, where nothing is learned; ripples of 2 percent lie on
 all of it. Runs scatter by 28 percent. Three searches get equally many runs: `random` on 20 seeds each, successive
 halving over seeds, which was the default once, and today's. All of them try the untuned setting, which lies anywhere.
+
+    python benchmarks/tuning.py --stored runs/tuning [--repetitions 100]
+
+In place of drawn surfaces, those of stored searches: the surrogate's mean after all trials of a search, with runs
+that scatter as its own. A search with a last round is repeated on each until it states 5 percent, or has 40 trials an
+option, and what it says is held against the surface. That is smoother than what was searched, so coverage is rather
+too good. Further tables say how much more steps take when an option moves by a factor of 2 (--repetitions 0: these
+alone), and what one setting for all tasks costs each model.
 """
 
 from __future__ import annotations
@@ -16,15 +24,23 @@ import concurrent.futures
 import math
 import os
 import time
+from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 from scipy.stats import qmc
 
-from qrlsuite.tuning.samplers import REGRET
-from qrlsuite.tuning.surrogate import BATCH, NEAR, SPREAD, Climb
+from qrlsuite import notation, options
+from qrlsuite.experiment import preset
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.results.store import entries
+from qrlsuite.statistics.times import times_below
+from qrlsuite.tuning.bayesian import FINALISTS, LAST_SEEDS, PER_OPTION
+from qrlsuite.tuning.samplers import LAST, REGRET
+from qrlsuite.tuning.surrogate import BATCH, NEAR, SPREAD, Climb, Surrogate, regret_among, variances
 
 Floats = NDArray[np.float64]
 VISIT = 4
@@ -69,6 +85,21 @@ class Surface:
         return math.exp(float(self(place[None])[0]) - self.least) - 1
 
 
+def measured(found: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+    """Return mean, spread in units of the mean, and number of the runs of each place."""
+    means = np.array([each.mean() for each in found])
+    spreads = np.array([each.std(ddof=1) for each in found]) / means
+    return means, spreads, np.array([len(each) for each in found], float)
+
+
+def visit(search: Climb, surface: Surface | Stored, found: dict[int, Floats]) -> None:
+    """Run the places that a search wants next, and tell it of all runs so far."""
+    for number in search.next():
+        drawn = surface.runs(search.tried[number], VISIT)
+        found[number] = np.concatenate([found.get(number, np.empty(0)), drawn])
+    search.tell([*found], *measured([*found.values()]))
+
+
 def climb(
     surface: Surface, untuned: Floats, runs: Sequence[int], seed: int, shared: int
 ) -> list[list[float]]:
@@ -91,12 +122,7 @@ def climb(
         while sum(map(len, found.values())) + VISIT * len(wanted := search.next()) <= most:
             visits += len(wanted)
             populations += len({search.tried[number][:shared].tobytes() for number in wanted})
-            for number in wanted:
-                drawn = surface.runs(search.tried[number], VISIT)
-                found[number] = np.concatenate([found.get(number, np.empty(0)), drawn])
-            means = np.array([each.mean() for each in found.values()])
-            spreads = np.array([each.std(ddof=1) / each.mean() for each in found.values()])
-            search.tell([*found], means, spreads, np.array([len(each) for each in found.values()], float))
+            visit(search, surface, found)
             if (
                 math.isnan(first[0])
                 and search.regret
@@ -172,6 +198,132 @@ def repeat(
     return np.concatenate([others, mine], axis=1)
 
 
+class Stored:
+    """The surface of a stored search; its preset file lies beside its trials."""
+
+    def __init__(self, path: Path) -> None:
+        found = preset.load(path)
+        record = found.tuning
+        assert record is not None
+        space = record.space or {}
+        self.varied, self.ends = [*space], np.log([[ends["low"], ends["high"]] for ends in space.values()])
+        entry = resolve(
+            record.task or "", notation.parse_entry(f"{found.algorithm} {found.model} preset={path}")
+        )
+        _, fixed = self._split(entry)
+        grid, steps = entry.task.file.ranking.grid, entry.task.file.protocol.interactions
+        self.name = f"{record.task} | {entry.label.partition(' preset=')[0]}"
+        kind = (found.model_options.get(name) for name in ("activation", "ansatz_options"))
+        self.task, self.model = record.task, " ".join([found.model, *(str(each) for each in kind if each)])
+        tried, runs = [], []
+        for store in entries(path.parent, record.task):
+            identity = store.record().identity
+            if (identity.algorithm, identity.model) != (found.algorithm, found.model):
+                continue
+            place, own = self._split(store.entry())
+            if own != fixed:
+                continue
+            search = [seed for seed in store.seeds() if seed < preset.TUNING_SEEDS + LAST_SEEDS]
+            if len(done := store.finished(search, record.epochs or 1)) >= VISIT:
+                curves = np.array([store.seed(seed).read().curve[: record.epochs] for seed in sorted(done)])
+                runs.append(times_below(curves, grid, steps).mean(axis=1))
+                tried.append(place)
+        numbers = measured(runs)
+        noise = variances(*numbers) / numbers[2]
+        self.surrogate = Surrogate(np.array(tried), np.log(numbers[0]) + noise / 2, noise)
+        many = numbers[2] >= min(2 * VISIT, numbers[2].max())
+        self.sources = [(at, own / own.mean()) for at, own, kept in zip(tried, runs, many) if kept]
+        low, high = np.min(tried, axis=0), np.max(tried, axis=0)
+        places = np.array([*tried, *(low + (high - low) * qmc.Halton(len(low), seed=0).random(4000))])
+        self.best = places[int(self(places).argmin())]
+        self.least = float(self(self.best[None])[0])
+        self.count = sum(map(len, runs))
+        self.generator = np.random.default_rng(0)
+
+    def _split(self, entry: Entry) -> tuple[Floats, object]:
+        """Return the place of an entry's varied options, and all that stays."""
+        sides = {"algorithm": entry.algorithm_options, "model": entry.model_options}
+        own = {f"{side}.{name}": v for side, each in sides.items() for name, v in options.plain(each).items()}
+        return self.place(np.array([own.pop(name) for name in self.varied])), own
+
+    def place(self, values: Floats) -> Floats:
+        """Return places, 0 and 1 at the ends of the ranges, of values (..., D)."""
+        result: Floats = (np.log(values) - self.ends[:, 0]) / np.diff(self.ends)[:, 0]
+        return result
+
+    def __call__(self, places: Floats) -> Floats:
+        """Return log mean steps (P,) at places (P, D)."""
+        return self.surrogate.means(places)
+
+    def runs(self, place: Floats, count: int) -> Floats:
+        """Draw runs that scatter around the surface's mean as those of the nearest setting with several."""
+        scatter = min(self.sources, key=lambda source: float(((source[0] - place) ** 2).sum()))[1]
+        return math.exp(float(self(place[None])[0])) * self.generator.choice(scatter, count)
+
+    def regret(self, place: Floats) -> float:
+        """Return the real regret of a place."""
+        return max(0.0, math.exp(float(self(place[None])[0]) - self.least) - 1)
+
+    def repeat(self, number: int) -> list[float]:
+        """Return runs; regret, said and inside before the last round; among the last, said, inside; regret after."""
+        self.generator = np.random.default_rng([74, number])
+        untuned = self.generator.random(len(self.varied))
+        search, found = Climb([untuned], extends=lambda d, low, high: False, seed=number), dict[int, Floats]()
+        most = PER_OPTION * len(self.varied) * VISIT
+        while not (said := search.regret) or (
+            said.expected > REGRET and sum(map(len, found.values())) < most
+        ):
+            visit(search, self, found)
+        real = self.regret(search.tried[search.best])
+        three = [search.tried[each] for each in search.order[:FINALISTS]]
+        last = [self.runs(each, LAST * VISIT) for each in three]
+        among = regret_among(*measured(last))
+        regrets = [self.regret(each) for each in three]
+        after = regrets[int(np.argmin([each.mean() for each in last]))]
+        own = (1 + after) / (1 + min(regrets)) - 1
+        inside = [each.low - 1e-9 <= at <= each.high + 1e-9 for each, at in ((said, real), (among, own))]
+        runs = sum(map(len, found.values()))
+        return [runs, real, said.expected, inside[0], own, among.expected, inside[1], after]
+
+
+def stored(folder: Path, repetitions: int) -> None:
+    """Print the tables of stored searches."""
+    searches = [Stored(path) for path in sorted(folder.glob("*.toml"))]
+    if repetitions:
+        print(
+            "task | entry | runs | regret | it says | within 90% | among three | it says | within 90% | after"
+        )
+    for each in searches if repetitions else ():
+        with concurrent.futures.ProcessPoolExecutor(os.cpu_count()) as pool:
+            runs, *shares = np.mean([*pool.map(each.repeat, range(repetitions))], axis=0)
+        print(
+            f"{each.name} | {runs:.0f} | {' | '.join(f'{share:.1%}' for share in shares)}",
+            flush=True,
+        )
+    print("\ntask | model | runs | option: more steps at half of the best value, at twice")
+    for each in searches:
+        told = []
+        for d, name in enumerate(each.varied):
+            move = np.eye(len(each.varied))[d] * math.log(2) / np.diff(each.ends)[d]
+            two = (f"{each.regret(each.best + sign * move):.0%}" for sign in (-1, 1))
+            told.append(f"{name.split('.')[1]}: {', '.join(two)}")
+        print(f"{each.name} | {each.count} | {' | '.join(told)}")
+    print("\nmodel | one setting for all tasks | more steps than at each task's own")
+    groups = defaultdict(list)
+    for each in searches:
+        groups[each.model, (*each.varied,)].append(each)
+    for (model, names), group in groups.items():
+        ends = np.array([each.ends for each in group])
+        low, high = ends[..., 0].min(axis=0), ends[..., 1].max(axis=0)
+        values = np.exp(low + (high - low) * qmc.Halton(len(names), seed=0).random(4000))
+        costs = np.array([each(each.place(values)) - each.least for each in group])
+        at = int(costs.mean(axis=0).argmin())
+        setting = " ".join(f"{n.split('.')[1]}={v:.3g}" for n, v in zip(names, values[at]))
+        print(
+            f"{model} | {setting} | {', '.join(f'{g.task} {math.expm1(c):.0%}' for g, c in zip(group, costs[:, at]))}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--options", type=int, default=6)
@@ -180,7 +332,11 @@ def main() -> None:
     parser.add_argument("--width", type=float, default=0.8)
     parser.add_argument("--ripple", type=float, default=0.02)
     parser.add_argument("--shared", type=int, default=0, help="options that take a population of their own")
+    parser.add_argument("--stored", type=Path, help="a folder of stored searches, such as runs/tuning")
     arguments = parser.parse_args()
+    if arguments.stored:
+        stored(arguments.stored, arguments.repetitions)
+        return
     begin = time.monotonic()
     with concurrent.futures.ProcessPoolExecutor(os.cpu_count()) as pool:
         count = arguments.repetitions
