@@ -81,6 +81,7 @@ def _facts(outcome: State, plain: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("Any false difference", f"with probability {looks.alpha:g} ({looks.spending} spending)"),
         ("Equal", f"within {100 * looks.margin:g} percent"),
+        *(("Claim, with an error of its own", text.removeprefix("claim: ")) for text in outcome.claims),
     ]
 
 

@@ -23,7 +23,7 @@ from qrlsuite.results.text import hours_text
 from qrlsuite.statistics import MIN_RUNS, LearningCurves, SmoothedRuns
 from qrlsuite.statistics.curves import common_horizon
 from qrlsuite.statistics.permutation import with_half_epoch
-from qrlsuite.statistics.planning import LADDER, Need, chances, runs_needed, runs_to_detect
+from qrlsuite.statistics.planning import LADDER, Need, chances, claim_chances, runs_needed, runs_to_detect
 from qrlsuite.statistics.times import mean_time, times_below
 from qrlsuite.studies.looks import Study
 
@@ -161,21 +161,30 @@ class StudyPower:
         The study's entry with most seeds, or one of its task where none of its own has `PILOT` seeds.
     seeds:
         The pilot's number of seeds.
+    claims:
+        For each claim and true lead of its entry the share of studies that establish it, by look.
     """
 
     found: dict[float, tuple[float, ...]]
     spread: float
     pilot: str
     seeds: int
+    claims: dict[str, tuple[float, ...]]
 
     @property
-    def sentence(self) -> str:
-        """Say the power at the last look."""
+    def sentences(self) -> list[str]:
+        """Say the power of the pairs at the last look, and that of each claim at every look."""
         shares = ", ".join(f"{lead:.0%} fewer in {100 * each[-1]:.0f}" for lead, each in self.found.items())
-        return (
+        pairs = (
             f"power: of 100 such studies, this many find an entry that needs fewer steps than every other: {shares}; "
             f"if seeds differ as the {self.seeds} of {self.pilot} do"
         )
+        claims = [
+            f"power at each look: of 100 such studies, this many establish: {claim}: "
+            + ", ".join(f"{100 * share:.0f}" for share in shares)
+            for claim, shares in self.claims.items()
+        ]
+        return [pairs, *claims]
 
 
 def study_power(study: Study) -> StudyPower | None:
@@ -200,8 +209,24 @@ def study_power(study: Study) -> StudyPower | None:
     spread = float(numbers.std(ddof=1) / numbers.mean())
     if not spread:
         return None
-    found = {lead: chances(study.design, spread, lead) for lead in SLOWER}
-    return StudyPower(found, spread, pilot.label, len(pilot.seeds))
+    design = study.design
+    found = {lead: chances(design, spread, lead) for lead in SLOWER}
+    claims = {
+        f"{claim.sentence}, if "
+        + (f"it needs {lead:.0%} fewer than each" if lead else "all need the same"): claim_chances(
+            design, claim, spread, lead
+        )
+        for claim in design.claims
+        for lead in (SLOWER if claim.at_most is None else (0.0,))
+    }
+    return StudyPower(found, spread, pilot.label, len(pilot.seeds), claims)
+
+
+def power_lines(power: StudyPower | None) -> list[str]:
+    """Return the sentences of a study's power, or the one that says what is lacking."""
+    if power is None:
+        return [f"power: unknown until {PILOT} seeds of an entry of this task are trained to the end"]
+    return power.sentences
 
 
 def _jobs(

@@ -530,6 +530,17 @@ class DecidedPair(Record):
     relabelings: Count | None = None
 
 
+class DecidedClaim(Record):
+    """A claim of a study at a look: one-sided p of each rival with its relabelings, and whether it is established."""
+
+    entry: str
+    rivals: list[str]
+    at_most: Number | None = None
+    p: list[Annotated[float, Field(ge=0, le=1)]]
+    relabelings: list[Count]
+    established: bool
+
+
 class LookLine(Record):
     """An event of the study whose hash is `plan`: it was begun or ended, or a look was taken at so many seeds.
 
@@ -546,6 +557,7 @@ class LookLine(Record):
     seeds: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
     look: Positive | None = None
     pairs: list[DecidedPair] = []
+    claims: list[DecidedClaim] = []
     seed: Count | None = None
     curves: str | None = None
 

@@ -16,7 +16,7 @@ import numpy as np
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.grid import Grid, IntArray, whole
-from qrlsuite.statistics.sequential import Decided, Decision, PairDecision, SequentialDesign, Spending
+from qrlsuite.statistics.sequential import Claim, Decided, Decision, PairDecision, SequentialDesign, Spending
 from qrlsuite.statistics.simulation import SmoothedRuns, draw_steps, judge_steps, play, slower
 from qrlsuite.statistics.times import check_probability
 
@@ -179,6 +179,30 @@ def chances(
             open_ &= ratio - error * normal.inv_cdf(level) >= math.log1p(design.margin)
         told.append(float(differs[:, counted_pairs].all(axis=1).mean()))
     return tuple(told)
+
+
+def claim_chances(
+    design: SequentialDesign, claim: Claim, spread: float, lead: float, n_studies: int = 4000, seed: int = 0
+) -> tuple[float, ...]:
+    """Return how often a claim is established by each look; arguments and approximation as of `chances`.
+
+    The claim's entry needs a fraction `lead` fewer steps than each rival: 0 or more, below 1.
+    """
+    if not 0 <= lead < 1:
+        raise OptionError(f"lead = {lead!r} is outside [0, 1)")
+    generator, normal = np.random.default_rng(seed), NormalDist()
+    sums = np.zeros((n_studies, len(claim.names)))
+    established, shares, before = np.zeros(n_studies, dtype=bool), list[float](), 0
+    for look, n_runs in enumerate(design.looks):
+        sums += generator.normal(scale=spread * math.sqrt(n_runs - before), size=sums.shape)
+        before, logs = n_runs, sums / n_runs
+        ratio = logs[:, 1:] - logs[:, :1] - math.log1p(-lead)
+        beyond = ratio if claim.at_most is None else math.log1p(claim.at_most) - ratio
+        reach = -normal.inv_cdf(design.claim_level(look, claim.shares)) * spread * math.sqrt(2 / n_runs)
+        every = np.all if claim.at_most is None else np.any
+        established |= every(beyond >= reach, axis=1)
+        shares.append(float(established.mean()))
+    return tuple(shares)
 
 
 def _fixed(drawn: Sequence[IntArray], powers: Sequence[float], alpha: float, most: int) -> list[int | None]:

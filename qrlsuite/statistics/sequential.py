@@ -12,6 +12,11 @@ added. By `steps`, relabelings of a look go on until no decision can turn.
 A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
 1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
 
+A claim about an entry and several rivals has an error alpha of its own, on one side. That the entry beats all of them
+is an intersection-union test: every rival at the full level, all at the same look (Berger 1982, Technometrics 24). That
+the best of them needs at most so much more is a union: each at alpha / number of rivals. An entry goes on while a pair
+or a claim needs it.
+
 `decide` is a function of the design and the runs so far, so that an interrupted study goes on where it was. A p that
 took many relabelings at a look may be handed over, to be checked by 10,000 and not computed again.
 """
@@ -23,6 +28,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
@@ -167,6 +173,45 @@ def _simpson(low: float, high: float) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
+class Claim:
+    """What a study claims about an entry and its rivals, at an error of its own.
+
+    Attributes
+    ----------
+    entry, rivals:
+        Names of entries.
+    at_most:
+        None: the entry needs fewer steps than each rival. 0.1: the best rival needs at most 10 percent more than it.
+    tasks:
+        Studies, each of another task, that are read together for it: it is tested until it holds at alpha / tasks.
+    """
+
+    entry: str
+    rivals: tuple[str, ...]
+    at_most: float | None = None
+    tasks: int = 1
+
+    @property
+    def sentence(self) -> str:
+        """The claim in words."""
+        rivals, several = ", ".join(self.rivals), len(self.rivals) > 1
+        if self.at_most is None:
+            return f"{self.entry} needs fewer steps than {'each of ' * several}{rivals}"
+        percent = f"{100 * self.at_most:g} percent"
+        return f"{'the best of ' * several}{rivals} needs at most {percent} more steps than {self.entry}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every entry that it needs."""
+        return (self.entry, *self.rivals)
+
+    @property
+    def shares(self) -> int:
+        """How many tests share its alpha: those of which a single one is enough."""
+        return 1 if self.at_most is None else len(self.rivals)
+
+
+@dataclass(frozen=True, slots=True)
 class SequentialDesign:
     """A study as it is fixed before the first run: pairs, looks, and error.
 
@@ -193,6 +238,8 @@ class SequentialDesign:
         Why the first look comes before 20 runs.
     rule:
         `steps`; or `times`, as studies of earlier versions have it.
+    claims:
+        Each has an error alpha of its own, on one side; by rule `steps`.
 
     Raises
     ------
@@ -210,6 +257,7 @@ class SequentialDesign:
     seed: int = 0
     reason: str = ""
     rule: str = "times"
+    claims: tuple[Claim, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.entries) < 2:
@@ -243,6 +291,14 @@ class SequentialDesign:
                 raise OptionError(f"pairs: '{first}' is compared with itself")
         if len({frozenset(pair) for pair in self.family}) != len(self.family) or not self.family:
             raise OptionError("pairs: a pair is repeated, or there is none")
+        if self.claims and self.rule != "steps":
+            raise OptionError(f"claims are tested by rule 'steps', and the study has rule '{self.rule}'")
+        for claim in self.claims:
+            for name in claim.names:
+                if name not in self.entries:
+                    raise OptionError(f"claims: '{name}' is not one of the entries {list(self.entries)}")
+            if len({*claim.names}) < len(claim.names):
+                raise OptionError(f"claims: {list(claim.names)}: a name is repeated")
 
     @property
     def family(self) -> tuple[tuple[str, str], ...]:
@@ -265,6 +321,10 @@ class SequentialDesign:
         if self.looks[look] not in allowed:
             return None
         return _level(allowed, allowed.index(self.looks[look]), self.alpha, Spending.OBRIEN_FLEMING, 1)
+
+    def claim_level(self, look: int, shares: int) -> float:
+        """Return the level of a one-sided p at look 0, 1, ... that has alpha / `shares`."""
+        return _level(self.looks, look, self.alpha / shares, self.spending, 1)
 
 
 class Decided(StrEnum):
@@ -365,8 +425,57 @@ class PairDecision:
 
 
 @dataclass(frozen=True, slots=True)
+class ClaimDecision:
+    """One claim after its last look.
+
+    Attributes
+    ----------
+    p, relabelings:
+        Of each rival at each look so far: its one-sided p, and the relabelings behind it.
+    n_runs:
+        Runs of each entry at its last look, 0 before the first.
+    established:
+        Runs at the first look at which it held at alpha; None while there is none.
+    closed:
+        Whether it needs no more runs.
+    excluded:
+        The smallest lead over all rivals that is excluded at its last look, on one side at alpha: 0.1 where the best
+        rival needs at most 10 percent more.
+    """
+
+    claim: Claim
+    p: tuple[tuple[float, ...], ...] = ()
+    relabelings: tuple[tuple[int, ...], ...] = ()
+    n_runs: int = 0
+    established: int | None = None
+    closed: bool = False
+    excluded: float = math.inf
+
+    def held(self, design: SequentialDesign, tasks: int = 1) -> int | None:
+        """Return the runs at the first look at which it holds at alpha / `tasks`; None where it does not."""
+        every = all if self.claim.at_most is None else any
+        for look, p in enumerate(self.p):
+            level = design.claim_level(look, tasks * self.claim.shares)
+            if every(each <= level for each in p):
+                return design.looks[look]
+        return None
+
+    @property
+    def verdict(self) -> str:
+        """What is known of the claim, in words."""
+        if not self.n_runs:
+            return "open"
+        if self.established is not None:
+            found = f"established at {self.established} seeds"
+        else:
+            found = f"{'not established' if self.closed else 'open'} after {self.n_runs} seeds"
+        lead = f"{100 * max(0, self.excluded):.0f} percent" if math.isfinite(self.excluded) else "none"
+        return f"{found}; the smallest lead that is excluded: {lead}"
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
-    """All pairs of a design after the looks for which there are runs.
+    """All pairs and claims of a design after the looks for which there are runs.
 
     Attributes
     ----------
@@ -375,16 +484,19 @@ class Decision:
     pairs:
         The pairs of the design, in order.
     wanted:
-        For each entry with an open pair: the runs that the next look needs. Empty when all is decided.
+        For each entry with an open pair or claim: the runs that the next look needs. Empty when all is decided.
+    claims:
+        The claims of the design, in order.
     """
 
     design: SequentialDesign
     pairs: tuple[PairDecision, ...]
     wanted: Mapping[str, int]
+    claims: tuple[ClaimDecision, ...] = ()
 
     @property
     def finished(self) -> bool:
-        """Whether every pair is closed."""
+        """Whether every pair and claim is closed."""
         return not self.wanted
 
 
@@ -399,8 +511,8 @@ def decide(
         The design.
     runs:
         For each entry of the design its runs so far, in the order of their seeds; entries without any may be
-        absent. A look takes place once every entry with an open pair has the runs for it. Runs beyond a look
-        count for later ones only; runs that come after all pairs of an entry are closed are not looked at.
+        absent. A look takes place once every entry with an open pair or claim has the runs for it. Runs beyond a look
+        count for later ones only; runs that come after all of an entry's are closed are not looked at.
     grid:
         Its E thresholds count; its deltas do not.
     known:
@@ -422,13 +534,17 @@ def decide(
         name: judged_numbers(design, times_below(each.values, grid, each.steps_per_epoch), epoch)
         for name, each in runs.items()
     }
-    pairs = begin(design)
+    pairs, claims = begin(design), [ClaimDecision(claim) for claim in design.claims]
     for look, n_runs in enumerate(design.looks):
         wanted = wanted_at(pairs, n_runs)
+        wanted |= {name: n_runs for each in claims if not each.closed for name in each.claim.names}
         if any(name not in times or len(times[name]) < n_runs for name in wanted):
-            return Decision(design, tuple(pairs), wanted)
+            return Decision(design, tuple(pairs), wanted, tuple(claims))
         [pairs] = next_look(design, look, [pairs], [times], known or {})
-    return Decision(design, tuple(pairs), {})
+        claims = [
+            each if each.closed else next_claim(design, look, each, times, known or {}) for each in claims
+        ]
+    return Decision(design, tuple(pairs), {}, tuple(claims))
 
 
 def judged_numbers(design: SequentialDesign, times: IntArray, epoch: int) -> IntArray:
@@ -508,6 +624,67 @@ def next_look(
                 result[study][index] = _relabeled(result[study][index], data[row], test, row)
         _close(design, look, result[study])
     return result
+
+
+def next_claim(
+    design: SequentialDesign,
+    look: int,
+    before: ClaimDecision,
+    times: Mapping[str, IntArray],
+    known: Known | None = None,
+) -> ClaimDecision:
+    """Return an open claim after look 0, 1, ...; arguments as for `next_look`, of one study.
+
+    As many runs of both make the law of t symmetric among relabelings: p of one side is half of that of two. For "at
+    most 10 percent more" the entry's numbers are multiplied by 1.1. Keys of `known` end with `at_most`.
+    """
+    claim, n_runs = before.claim, design.looks[look]
+    factor = Fraction(1 + (claim.at_most or 0)).limit_denominator(1000)
+    own = times[claim.entry][:n_runs] * factor.numerator
+    sides = [(own, times[rival][:n_runs] * factor.denominator) for rival in claim.rivals]
+    data = sides if claim.at_most is None else [(rival, entry) for entry, rival in sides]
+    test = MaxT(data, design.blocks[: look + 1], design.seed, ratio=True)
+    test.extend(CHUNK)
+    if known is not None:
+        for row, rival in enumerate(claim.rivals):
+            p, count = known.get((n_runs, (claim.entry, rival, str(claim.at_most))), (1.0, 0))
+            test.resume(row, 2 * min(p, 1 - p), count)
+        one_sided = [design.claim_level(look, tasks * claim.shares) for tasks in range(1, 1 + claim.tasks)]
+        levels = [np.full(len(data), min(2 * level, 0.999)) for level in one_sided]
+        relabel(test, lambda: np.any([test.turns(each, RISK / len(data)) for each in levels], axis=0))
+    p_one = np.where(test.t[:, 0] > 0, test.p / 2, 1 - test.p / 2)
+    now = replace(
+        before,
+        n_runs=n_runs,
+        p=(*before.p, tuple(p_one.tolist())),
+        relabelings=(*before.relabelings, tuple(test.n_relabelings.tolist())),
+    )
+    reaches = (
+        test.critical(2 * design.claim_level(look, len(data)))
+        if known is not None
+        else [math.inf] * len(data)
+    )
+    ends = []
+    for side, reach in zip(sides, reaches):
+        ratio, error, _ = _log_ratio(side)
+        ends.append(ratio + math.log(factor) + (reach * error if error else 0.0))
+    held = now.held(design)
+    excluded = math.expm1(min(ends))
+    if claim.at_most is not None:  # which its p has decided
+        excluded = (max if held is None else min)(excluded, claim.at_most)
+    closed = n_runs == design.looks[-1] or now.held(design, claim.tasks) is not None
+    return replace(now, established=held, closed=closed, excluded=excluded)
+
+
+def holm_claims(decided: Sequence[tuple[SequentialDesign, ClaimDecision]], tasks: int) -> list[bool]:
+    """Return which of the claims of several studies hold, each of its own task: Holm's procedure over `tasks`."""
+    holds = [False] * len(decided)
+    while True:
+        left = max(1, tasks - sum(holds))
+        now = [claim.held(design, left) is not None for design, claim in decided]
+        if now == holds:
+            return holds
+        holds = now
 
 
 def _looked(

@@ -33,11 +33,11 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
 from qrlsuite.results import requests
-from qrlsuite.results.records import DecidedPair, LookLine
+from qrlsuite.results.records import DecidedClaim, DecidedPair, LookLine
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, json_line, read_records, write_atomically
 from qrlsuite.statistics import Grid, LearningCurves, SequentialDesign, decide
-from qrlsuite.statistics.sequential import Decision
+from qrlsuite.statistics.sequential import Claim, Decision
 from qrlsuite.studies.state import State
 from qrlsuite.studies.study import (
     EntriesSection,
@@ -122,6 +122,9 @@ class Study:
             pairs=tuple(pair for asked in looks.questions for pair in asked.pairs) or None,
             reason=looks.reason,
             rule=looks.rule,
+            claims=tuple(
+                Claim(each.entry, tuple(each.rivals), each.at_most, each.tasks) for each in looks.claims
+            ),
         )
 
     @property
@@ -238,7 +241,7 @@ class Study:
         if state.ended is not None:
             raise OptionError(f"{self.source}: the study was ended on {state.ended} already")
         if state.decision.finished:
-            raise OptionError(f"{self.source}: every pair is closed, so there is nothing to end")
+            raise OptionError(f"{self.source}: all is decided, so there is nothing to end")
         append(self.folder / LOG, json_line({"ended": _now()}))
 
     def read(self) -> State:
@@ -286,12 +289,18 @@ class Study:
                 values = np.stack([done[seed][: self.epochs] for seed in seeds[name]])
                 steps = self.entries[name].task.file.protocol.interactions
                 curves[name] = LearningCurves(values, steps, name)
-        known = {
+        seen = [line for line in log if line.curves is not None and line.curves == _seen(line, curves)]
+        known: dict[tuple[int, tuple[str, ...]], tuple[float, int]] = {
             (line.look or 0, tuple(pair.pair)): (pair.p, pair.relabelings)
-            for line in log
-            if line.curves is not None and line.curves == _seen(line, curves)
+            for line in seen
             for pair in line.pairs
             if pair.p is not None and pair.relabelings
+        }
+        known |= {
+            (line.look or 0, (claim.entry, rival, str(claim.at_most))): (p, count)
+            for line in seen
+            for claim in line.claims
+            for rival, p, count in zip(claim.rivals, claim.p, claim.relabelings)
         }
         decision = decide(self.design, curves, self.grid, known)
         self._compare(_lines(self.design, decision, curves), log)
@@ -315,6 +324,11 @@ class Study:
                     f"; it found '{then.decided}' for {' and '.join(now.pair)}, now it is '{now.decided}'"
                     for now, then in zip(line.pairs, before.pairs)
                     if now.decided != then.decided
+                ]
+                turned += [
+                    f"; a claim about {now.entry} was{' not' * now.established} established"
+                    for now, then in zip(line.claims, before.claims)
+                    if now.established != then.established
                 ]
                 if turned or before.curves not in (None, line.curves):
                     raise StoreError(
@@ -555,8 +569,9 @@ def _content(file: StudyFile) -> dict[str, Any]:
     """Return all that decides, in the layout of version 0.1, whose studies keep their hash."""
     looks = (file.looks or LooksSection()).model_dump(mode="json")
     task = next((table.task for table in file.entries), None)
-    if not looks["questions"]:
-        del looks["questions"]
+    for key in ("questions", "claims"):
+        if not looks[key]:
+            del looks[key]
     keys = {"model", "algorithm", "preset", "options", "hash", "name", "tuning", "code"}
     entries = [table.model_dump(mode="json", include=keys) for table in file.entries]
     for entry in entries:
@@ -569,7 +584,7 @@ def _content(file: StudyFile) -> dict[str, Any]:
 def _lines(
     design: SequentialDesign, decision: Decision, curves: Mapping[str, LearningCurves]
 ) -> list[LookLine]:
-    """Return the results of each look: for every open pair, its p and how it was closed."""
+    """Return the results of each look: for every open pair and claim, its p and how it was closed."""
     lines = []
     for index, look in enumerate(design.looks):
         pairs = [
@@ -582,8 +597,22 @@ def _lines(
             for pair in decision.pairs
             if index < len(pair.p)
         ]
-        if pairs:
+        claims = [
+            DecidedClaim(
+                entry=each.claim.entry,
+                rivals=list(each.claim.rivals),
+                at_most=each.claim.at_most,
+                p=list(each.p[index]),
+                relabelings=list(each.relabelings[index]),
+                established=each.established is not None and each.established <= look,
+            )
+            for each in decision.claims
+            if index < len(each.p)
+        ]
+        if pairs or claims:
             line = LookLine(look=look, pairs=pairs)
+            if claims:
+                line = line.changed(claims=[claim.content for claim in claims])
             seen = {"seed": design.seed, "curves": _seen(line, curves)} if design.rule == "steps" else {}
             lines.append(line.changed(**seen))
     return lines
@@ -591,8 +620,9 @@ def _lines(
 
 def _seen(line: LookLine, curves: Mapping[str, LearningCurves]) -> str:
     """Return the digest of the curves that a look sees, of those that are there."""
-    names = {name for pair in line.pairs for name in pair.pair if name in curves}
-    return digest({name: curves[name].values[: line.look].tolist() for name in names})
+    names = {name for pair in line.pairs for name in pair.pair}
+    names |= {name for claim in line.claims for name in (claim.entry, *claim.rivals)}
+    return digest({name: curves[name].values[: line.look].tolist() for name in names & {*curves}})
 
 
 def _names(entries: Sequence[Entry]) -> list[str]:

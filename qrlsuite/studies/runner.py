@@ -294,7 +294,7 @@ def take_looks(study: Study, where: Where, budget: str | None, quiet: bool) -> S
 
 def _say_look(decision: Decision, console: Console) -> None:
     """Print the verdicts of the newest look, while more is trained."""
-    looks = max((len(pair.p) for pair in decision.pairs), default=0)
+    looks = max([len(pair.p) for pair in decision.pairs] + [len(claim.p) for claim in decision.claims])
     if not looks:
         return
     console.print(f"\n[bold]look at {decision.design.looks[looks - 1]} seeds[/bold]")
@@ -305,3 +305,6 @@ def _say_look(decision: Decision, console: Console) -> None:
                 markup=False,
                 soft_wrap=True,
             )
+    for claim in decision.claims:
+        if len(claim.p) == looks:
+            console.print(f"{claim.claim.sentence}: {claim.verdict}", markup=False, soft_wrap=True)

@@ -7,7 +7,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -110,10 +110,16 @@ class State(Shown):
     def looked(self) -> dict[str, int]:
         """Seeds of each entry at its last look; 0 where no look has reached it."""
         seeds = dict.fromkeys(self.study.entries, 0)
-        for pair in self.pairs:
-            for name in (pair.first, pair.second):
-                seeds[name] = max(seeds[name], pair.n_runs)
+        looked = [(name, pair.n_runs) for pair in self.pairs for name in (pair.first, pair.second)]
+        looked += [(name, each.n_runs) for each in self.decision.claims for name in each.claim.names]
+        for name, n_runs in looked:
+            seeds[name] = max(seeds[name], n_runs)
         return seeds
+
+    @property
+    def claims(self) -> list[str]:
+        """A sentence for each claim: what is claimed, and whether it is established."""
+        return [f"claim: {each.claim.sentence}: {each.verdict}" for each in self.decision.claims]
 
     def labeled(self, words: Sequence[str]) -> State:
         """Return the state with names of your own, `ENTRY=TEXT` each."""
@@ -134,7 +140,15 @@ class State(Shown):
         study = copy.copy(self.study)
         study.entries = renamed(study.entries)
         pairs = (replace(p, first=called[p.first], second=called[p.second]) for p in self.pairs)
-        decision = replace(self.decision, pairs=tuple(pairs), wanted=renamed(self.decision.wanted))
+        claims = tuple(
+            replace(
+                each, claim=replace(each.claim, entry=called[entry], rivals=tuple(called[n] for n in rivals))
+            )
+            for each in self.decision.claims
+            for entry, *rivals in [each.claim.names]
+        )
+        wanted = renamed(self.decision.wanted)
+        decision = replace(self.decision, pairs=tuple(pairs), wanted=wanted, claims=claims)
         facts: dict[str, Any] = {
             name: renamed(getattr(self, name)) for name in ("seeds", "curves", "hours", "lost")
         }
@@ -196,6 +210,15 @@ class State(Shown):
                 {"question": asked or None, **self._pair(pair)}
                 for asked, pairs in by_question(study, decision.pairs)
                 for pair in pairs
+            ],
+            "claims": [
+                {
+                    **asdict(each),
+                    "claim": each.claim.sentence,
+                    "verdict": each.verdict,
+                    "excluded": _number(each.excluded),
+                }
+                for each in decision.claims
             ],
             "entries": [
                 {
@@ -273,6 +296,12 @@ class State(Shown):
             if sheet.title != study.file.summary:
                 yield Text(sheet.title, style="bold")
             yield replace(sheet, title="")
+        yield from map(Text, self.claims)
+        if self.claims:
+            yield Text(
+                f"Each claim has an error of {study.looks.alpha:g} of its own, on one side, over all looks. A lead of "
+                "10 percent: the best of its rivals needs 10 percent more."
+            )
         if any(pair.p for pair in self.pairs):
             yield Text(
                 "B against A: how many more steps B needs, on average over the thresholds (+52% = B is slower), with "

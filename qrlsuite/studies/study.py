@@ -89,6 +89,19 @@ class Question(Table):
     pairs: Annotated[list[tuple[str, str]], Field(min_length=1)]
 
 
+class ClaimSection(Table):
+    """A claim about one entry and several others, which has an error of its own."""
+
+    entry: str
+    rivals: Annotated[list[str], Field(min_length=1)]
+    at_most: Annotated[
+        float | None, Field(gt=0, le=10, description="0.1: the best rival needs at most 10 percent more")
+    ] = None
+    tasks: Annotated[
+        int, Field(ge=1, le=LARGEST, description="studies, each of another task, that are read together")
+    ] = 1
+
+
 class LooksSection(Table):
     """When entries are compared, at which error and on which seeds: fixed once the first seed is begun."""
 
@@ -124,6 +137,9 @@ class LooksSection(Table):
     written: AwareDatetime | None = None
     questions: Annotated[
         list[Question], Field(description="which pairs are compared; every pair of entries without them")
+    ] = []
+    claims: Annotated[
+        list[ClaimSection], Field(description="about an entry and several rivals, each at alpha on one side")
     ] = []
 
     @property

@@ -7,7 +7,7 @@ first look count here: every pair has them, whatever they showed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from qrlsuite.results.text import interval_text, p_text, percent
 from qrlsuite.statistics import MeanRatio, mean_ratio, times_below
 from qrlsuite.statistics.across import DRAWN
 from qrlsuite.statistics.grid import IntArray
+from qrlsuite.statistics.sequential import holm_claims
 from qrlsuite.statistics.times_board import holm
 from qrlsuite.studies.state import State, by_question
 
@@ -75,11 +76,14 @@ class StudiesTogether(Shown):
         The pairs that all studies compare and that have a ratio, in the order of the first study.
     left_out:
         One line for each pair that has no ratio.
+    claims:
+        The tasks on which each claim holds that all studies make, by Holm's procedure.
     """
 
     studies: tuple[State, ...]
     pairs: tuple[SharedPair, ...]
     left_out: tuple[str, ...]
+    claims: Mapping[str, tuple[str, ...]]
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -148,6 +152,7 @@ class StudiesTogether(Shown):
             "changed": self.changed,
             "left_out": list(self.left_out),
             "pairs": [record(self.columns(), pair) for pair in self.pairs],
+            "claims": {claim: list(tasks) for claim, tasks in self.claims.items()},
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -168,6 +173,10 @@ class StudiesTogether(Shown):
                 else "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
             )
         )
+        alpha = max(each.study.looks.alpha for each in self.studies)
+        for claim, tasks in self.claims.items():
+            where = f"established on {', '.join(tasks) or 'none'}"
+            yield Text(f"claim: {claim}: {where} (by all looks; error {alpha:g} over the tasks, Holm)")
         yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
             yield Text(f"entries with other options on another task: {', '.join(self.changed)}")
@@ -215,7 +224,19 @@ def together(studies: Sequence[State]) -> StudiesTogether:
         SharedPair(asked, first, second, replace(ratio, p=p, drawn_p=other))
         for (asked, first, second, ratio), p, other in zip(ratios, adjusted, drawn)
     )
-    return StudiesTogether(tuple(studies), found, tuple(left_out))
+    return StudiesTogether(tuple(studies), found, tuple(left_out), dict(_claims(studies)))
+
+
+def _claims(studies: Sequence[State]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield each claim that all studies make, and the tasks on which it holds."""
+    by_study = [{each.claim.sentence: each for each in state.decision.claims} for state in studies]
+    for claim in by_study[0]:
+        if all(claim in claims for claims in by_study):
+            decided = [claims[claim] for claims in by_study]
+            count = max(len(studies), *(each.claim.tasks for each in decided))
+            holds = holm_claims([(state.study.design, each) for state, each in zip(studies, decided)], count)
+            tasks = tuple(state.study.task for state, held in zip(studies, holds) if held)
+            yield f"on at least one of {count} tasks {claim}", tasks
 
 
 def _shared(studies: Sequence[State]) -> Iterator[tuple[str, str, str]]:

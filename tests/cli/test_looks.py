@@ -544,16 +544,27 @@ pairs = [["wide", "narrow"]]
 text = "Is 16 too much?"
 pairs = [["mlp width=8", "wide"]]
 """
+CLAIMS = """
+[[looks.claims]]
+entry = "mlp width=8"
+rivals = ["narrow", "wide"]
+tasks = 2
+
+[[looks.claims]]
+entry = "mlp width=8"
+rivals = ["narrow", "wide"]
+at_most = 0.1
+"""
 
 
-def ask() -> str:
+def ask(claims: str = "") -> str:
     """Write a study of three entries that asks two questions and calls two entries by names of its own."""
     study = write()
     head, *tables = Path(study).read_text().split("\n[[entries]]\n")
     named = [
         f'name = "{name}"\n{table}' if name else table for name, table in zip(("wide", "", "narrow"), tables)
     ]
-    Path(study).write_text("\n[[entries]]\n".join([head + QUESTIONS, *named]))
+    Path(study).write_text("\n[[entries]]\n".join([head + QUESTIONS + claims, *named]))
     return study
 
 
@@ -568,6 +579,10 @@ rule = "steps" => rule = "intervals" => rule
 "mlp width=8", "wide" => "narrow", "wide" => a pair is repeated
 "mlp width=8", "wide" => "wide" => looks.questions.1.pairs.0
 [["wide", "narrow"]] => [] => looks.questions.0.pairs
+at_most = 0.1 => at_most = 0 => looks.claims.1.at_most
+"narrow", "wide"]\ntasks => "narow", "wide"]\ntasks => claims: 'narow' is not one of the entries
+"wide"]\ntasks => "mlp width=8"]\ntasks => a name is repeated
+rule = "steps" => rule = "times" => claims are tested by rule 'steps'
 name = "narrow" => name = "wide" => two groups are named 'wide'
 name = "narrow" => name = "\u001b[31m" => entries.2.name
 """
@@ -577,7 +592,7 @@ name = "narrow" => name = "\u001b[31m" => entries.2.name
 def test_a_wrong_study_file_is_refused_in_one_line(
     old: str, new: str, message: str, refused: Refused
 ) -> None:
-    edit(ask(), old, new)
+    edit(ask(CLAIMS), old, new)
     assert message in refused("show", "widths.toml")
 
 
@@ -778,3 +793,36 @@ def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> N
         (("mlp", "gru", "drqn"), "or several studies"),
     ):
         assert said in refused("show", *names)
+
+
+def test_claims_are_fixed_stored_shown_and_checked(refused: Refused) -> None:
+    """The best rival is as fast: at most 10 percent is established at 40 seeds, and the lead stays open to the end."""
+    plain = answer("show", ask())["hash"]
+    Path("widths.toml").unlink()
+    assert answer("show", ask(CLAIMS))["hash"] != plain
+    shown = say("show", "widths.toml").stdout
+    assert "claim: mlp width=8 needs fewer steps than each of narrow, wide: open" in shown
+    assert "power: unknown until 10 seeds" in shown
+    found = run()
+    beats, at_most = found["claims"]
+    assert (beats["established"], beats["closed"], beats["n_runs"]) == (None, True, 100)
+    assert (at_most["established"], at_most["closed"]) == (20, True)
+    assert 0 < beats["excluded"] < at_most["excluded"] <= 0.1
+    assert [each["seeds"] for each in found["entries"]] == [100, 100, 100], (
+        "the pairs were closed by 20 and 40"
+    )
+    log = Path("runs/decisions/widths/looks.jsonl")
+    looks = [json.loads(line) for line in log.read_text().splitlines()][1:]
+    assert [[each["established"] for each in look.get("claims", [])] for look in looks] == [
+        [False, True], [False], [False], [False], [False]
+    ]  # fmt: skip
+    assert [len(look["pairs"]) for look in looks] == [2, 1, 0, 0, 0]
+    before = log.read_bytes()
+    assert run() == answer("show", "widths.toml") == found
+    assert log.read_bytes() == before
+    shown = say("show", "widths.toml", "--label", "wide=Wide").stdout
+    best = "claim: the best of narrow, Wide needs at most 10 percent more steps than mlp width=8"
+    assert f"{best}: established at 20 seeds; the smallest lead that is excluded: " in shown
+    assert before.count(b'"established":true') == 1
+    log.write_bytes(before.replace(b'"established":true', b'"established":false'))
+    assert "a claim about mlp width=8 was not established" in refused("show", "widths.toml")

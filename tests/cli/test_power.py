@@ -74,3 +74,17 @@ def test_a_weak_pilot_is_marked_and_the_shorter_horizon_said() -> None:
     shown = power("mlp width=16", "mlp width=8")
     assert "900 steps, 20 pairs per line" in shown
     assert "Fewer than 20 seeds are a weak pilot" in shown
+
+
+def test_a_study_that_has_not_begun_says_the_power_of_its_claims() -> None:
+    """Runs that differ by a tenth: half of the steps is found at the first look."""
+    put(16, *([9, 10, 11] * 10))
+    say("study", "new", "w.toml", "mlp width=16", "mlp width=8", "--task", "tiny.toml", "--epochs", "20")
+    head, entries = Path("w.toml").read_text().split("\n[[entries]]\n", 1)
+    claim = '\n[[looks.claims]]\nentry = "mlp width=16"\nrivals = ["mlp width=8"]\n'
+    Path("w.toml").write_text(f"{head}{claim}{claim}at_most = 0.1\n\n[[entries]]\n{entries}")
+    shown = say("show", "w.toml").stdout
+    assert "needs fewer steps than mlp width=8, if it needs 50% fewer than each: 100, 100, 100" in shown
+    most = "mlp width=8 needs at most 10 percent more steps than mlp width=16, if all need the same: "
+    first, *_, last = map(int, shown.split(most)[1].splitlines()[0].split(", "))
+    assert 5 < first < last

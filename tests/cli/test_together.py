@@ -14,9 +14,10 @@ from scipy.stats import ttest_1samp
 from qrlsuite import api
 from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.statistics import across
-from qrlsuite.statistics.sequential import Decided
+from qrlsuite.statistics.sequential import Claim, ClaimDecision, Decided
 from qrlsuite.statistics.times_board import holm
 from qrlsuite.studies import together as studies_together
+from qrlsuite.studies.state import State
 from qrlsuite.studies.together import StudiesTogether, together
 from tests.commands import answer, say
 from tests.leaderboard.boards import refused
@@ -126,3 +127,21 @@ def test_a_pair_without_a_ratio_is_left_out_alone() -> None:
     assert [line.partition(":")[0] for line in read.left_out] == ["10 qubits / sine 44", "sine 44 / width 14"]
     assert "left out: 10 qubits / sine 44: " in repr(read)
     assert "left out: 10 qubits / sine 44: " in " ".join(drawing.draw_together(read).get_supxlabel().split())
+
+
+def test_a_claim_that_all_studies_make_names_the_tasks_where_it_holds() -> None:
+    def claiming(name: str, p: float, tasks: int = 1) -> State:
+        state = api.read_study(name)
+        assert isinstance(state, State)
+        claim = Claim("10 qubits", ("width 14",), tasks=tasks)
+        other = replace(claim, rivals=(f"width {tasks}",))
+        decided = [ClaimDecision(claim, ((p,),), ((0,),), 20), ClaimDecision(other, ((0.0,),), ((0,),), 20)]
+        return replace(state, decision=replace(state.decision, claims=tuple(decided)))
+
+    level = api.read_study(TOGETHER[1]).study.design.claim_level(0, 2)  # type: ignore[union-attr]
+    text = "on at least one of {} tasks 10 qubits needs fewer steps than width 14"
+    both = together([claiming(TOGETHER[1], 0.9 * level), claiming(TOGETHER[2], 1.1 * level)])
+    assert {text.format(2): ("beam6g-degree5", "beam6g-a3-0")}.items() <= both.claims.items()
+    seven = together([claiming(TOGETHER[1], 0.9 * level, 7), claiming(TOGETHER[2], 1.1 * level)])
+    assert seven.claims == {text.format(7): ()}, "of seven planned studies two are given"
+    assert f"claim: {text.format(7)}: established on none (by all looks; " in " ".join(repr(seven).split())

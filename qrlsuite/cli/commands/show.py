@@ -95,6 +95,10 @@ def show(
         typer.echo(f"wrote {out}")
     elif not isinstance(found, dict):
         table_console().print(found, soft_wrap=True)
+        if studies and not getattr(found, "begun", True):
+            from qrlsuite.api.needs import power_lines, study_power  # slow to import
+
+            typer.echo("\n".join(power_lines(study_power(found.study))))
     elif format is not None and "text" in found:
         typer.echo(found["text"], nl=False)
     else:

@@ -11,7 +11,7 @@ import typer
 
 from qrlsuite import api, registry, specs
 from qrlsuite.api.arguments import where_of
-from qrlsuite.api.needs import PILOT, study_power
+from qrlsuite.api.needs import power_lines, study_power
 from qrlsuite.api.studies import (
     ALL,
     end_study,
@@ -92,7 +92,8 @@ def new(
 ) -> None:
     """Write a study with looks: it compares entries with as many seeds as it takes. Trains nothing.
 
-    Every pair is compared. To compare only some pairs, add [[looks.questions]] with these pairs to the file.
+    Every pair is compared. To compare only some pairs, add [[looks.questions]] with these pairs to the file; claims
+    about an entry and several rivals are [[looks.claims]], and `qrlsuite show` then has their power.
 
     Example: qrlsuite study new width.toml "mlp width=64" "mlp width=32" --task beam6g
     """
@@ -103,10 +104,7 @@ def new(
         typer.echo(json.dumps({**outcome.as_dict(), "power": None if found is None else asdict(found)}))
         return
     table_console().print(outcome, soft_wrap=True)
-    if found is None:
-        typer.echo(f"power: unknown until {PILOT} seeds of an entry of this task are trained to the end")
-    else:
-        typer.echo(found.sentence)
+    typer.echo("\n".join(power_lines(found)))
     typer.echo(f"wrote {path}")
     typer.echo(f"next: {command('study', 'run', str(path), runs=runs)}")
 
