@@ -15,7 +15,7 @@ A pair is equal within the margin if two one-sided tests on the log ratio of the
 A claim about an entry and several rivals has an error alpha of its own, on one side. That the entry beats all of them
 is an intersection-union test: every rival at the full level, all at the same look (Berger 1982, Technometrics 24). That
 the best of them needs at most so much more is a union: each at alpha / number of rivals. An entry goes on while a pair
-or a claim needs it.
+or a claim needs it; that it beats all is given up where a pair says that a rival needs fewer steps.
 
 `decide` is a function of the design and the runs so far, so that an interrupted study goes on where it was. A p that
 took many relabelings at a look may be handed over, to be checked by 10,000 and not computed again.
@@ -469,8 +469,9 @@ class ClaimDecision:
             found = f"established at {self.established} seeds"
         else:
             found = f"{'not established' if self.closed else 'open'} after {self.n_runs} seeds"
-        lead = f"{100 * max(0, self.excluded):.0f} percent" if math.isfinite(self.excluded) else "none"
-        return f"{found}; the smallest lead that is excluded: {lead}"
+        if not math.isfinite(self.excluded):
+            return f"{found}; no lead is excluded"
+        return f"{found}; leads above {100 * max(0, self.excluded):.0f} percent are excluded"
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,7 +545,15 @@ def decide(
         claims = [
             each if each.closed else next_claim(design, look, each, times, known or {}) for each in claims
         ]
+        claims = [replace(each, closed=each.closed or _lost(each.claim, pairs)) for each in claims]
     return Decision(design, tuple(pairs), {}, tuple(claims))
+
+
+def _lost(claim: Claim, pairs: Sequence[PairDecision]) -> bool:
+    """Whether a rival was found to need fewer steps than an entry that is claimed to beat it."""
+    found = [(p.first, p.second) for p in pairs if p.decided is Decided.FIRST]
+    found += [(p.second, p.first) for p in pairs if p.decided is Decided.SECOND]
+    return claim.at_most is None and any((rival, claim.entry) in found for rival in claim.rivals)
 
 
 def judged_numbers(design: SequentialDesign, times: IntArray, epoch: int) -> IntArray:

@@ -822,7 +822,7 @@ def test_claims_are_fixed_stored_shown_and_checked(refused: Refused) -> None:
     assert log.read_bytes() == before
     shown = say("show", "widths.toml", "--label", "wide=Wide").stdout
     best = "claim: the best of narrow, Wide needs at most 10 percent more steps than mlp width=8"
-    assert f"{best}: established at 20 seeds; the smallest lead that is excluded: " in shown
+    assert f"{best}: established at 20 seeds; leads above " in shown
     assert before.count(b'"established":true') == 1
     log.write_bytes(before.replace(b'"established":true', b'"established":false'))
     assert "a claim about mlp width=8 was not established" in refused("show", "widths.toml")

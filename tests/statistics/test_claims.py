@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,7 +96,7 @@ def test_an_open_claim_keeps_its_entries_and_all_rivals_are_beaten_at_one_look()
     assert first.wanted == {"a": 200, "b": 200, "c": 200}, "the pair is closed, a claim is open"
     beats, at_most = first.claims
     assert (beats.p[0][0] < 1e-3, beats.p[0][1] > 0.01) == (True, True)
-    assert beats.verdict.startswith("open after 20 seeds; the smallest lead that is excluded: ")
+    assert beats.verdict.startswith("open after 20 seeds; leads above ")
     assert (at_most.established, at_most.closed) == (20, True), "c needs as many, whatever b needs"
     assert 0 < at_most.excluded < 0.1
     ended = decide(design, runs(200), grid)
@@ -102,6 +104,20 @@ def test_an_open_claim_keeps_its_entries_and_all_rivals_are_beaten_at_one_look()
     assert ended.claims[0].p[1][1] < 1e-3 < ended.claims[0].p[1][0], "the other one, and not both at one look"
     assert ended.claims[0].verdict.startswith("not established after 200 seeds; ")
     assert ended.claims[1] == at_most
+
+
+def test_that_it_beats_all_is_given_up_where_a_pair_says_the_reverse() -> None:
+    slow, fast = np.resize((29, 31), 20), np.resize((9, 11), 20)
+    runs = {
+        name: LearningCurves((np.arange(40) >= each[:, None]).astype(float), 100, name)
+        for name, each in {"a": slow, "b": slow, "c": fast}.items()
+    }
+    design = SequentialDesign(("a", "b", "c"), (20, 200), pairs=(("c", "a"),), rule="steps", claims=(BEATS,))
+    decision = decide(design, runs, Grid.relative([0.1], [0.5]))
+    assert decision.finished
+    assert decision.claims[0].verdict.startswith("not established after 20 seeds; ")
+    other = decide(replace(design, pairs=(("a", "b"),)), runs, Grid.relative([0.1], [0.5]))
+    assert other.wanted == {"a": 200, "b": 200, "c": 200}, "no pair says it"
 
 
 @pytest.mark.parametrize(
