@@ -138,6 +138,7 @@ def train_group(
             places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress
             run.run()
+            report(state, force=True)  # that so many seeds fit, before more begin
             del run
         state.phase, state.epoch, state.untried = "finished", epochs, False
         report(state, force=True)

@@ -195,12 +195,22 @@ class State(Shown):
         closed = [name for name in study.entries if name not in decision.wanted]
         saved = {name: protocol[name] - used[name] for name in closed if used[name]}
         times = self.mean_times()
+        looks = study.looks.model_dump(mode="json", exclude=None if study.looks.claims else {"claims"})
+        claims = [
+            {
+                **asdict(each),
+                "claim": each.claim.sentence,
+                "verdict": each.verdict,
+                "excluded": _number(each.excluded),
+            }
+            for each in decision.claims
+        ]
         return {
             "name": study.name,
             "summary": study.file.summary,
             "hash": study.hash,
             "task": study.task,
-            "looks": study.looks.model_dump(mode="json") | {"levels": self.levels()},
+            "looks": looks | {"levels": self.levels()},
             "begun": self.begun,
             "finished": decision.finished,
             "begun_at": self.begun_at,
@@ -210,15 +220,6 @@ class State(Shown):
                 {"question": asked or None, **self._pair(pair)}
                 for asked, pairs in by_question(study, decision.pairs)
                 for pair in pairs
-            ],
-            "claims": [
-                {
-                    **asdict(each),
-                    "claim": each.claim.sentence,
-                    "verdict": each.verdict,
-                    "excluded": _number(each.excluded),
-                }
-                for each in decision.claims
             ],
             "entries": [
                 {
@@ -239,6 +240,7 @@ class State(Shown):
             "core_hours_saved": self.cost(saved),
             "core_hours_at_most": self.cost(dict.fromkeys(study.entries, study.design.looks[-1])),
             "submitted": list(self.submitted),
+            **({"claims": claims} if claims else {}),
             **({"lost": dict(self.lost)} if self.lost else {}),
             **({"notes": list(self.notes)} if self.notes else {}),
         }

@@ -152,7 +152,11 @@ class StudiesTogether(Shown):
             "changed": self.changed,
             "left_out": list(self.left_out),
             "pairs": [record(self.columns(), pair) for pair in self.pairs],
-            "claims": {claim: list(tasks) for claim, tasks in self.claims.items()},
+            **(
+                {"claims": {claim: list(tasks) for claim, tasks in self.claims.items()}}
+                if self.claims
+                else {}
+            ),
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
