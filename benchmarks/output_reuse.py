@@ -44,7 +44,7 @@ VARIANTS = {  # name: options, whether the rate is that of the weights alone, fa
 
 @contextmanager
 def changed(weights_alone: bool, biases: float) -> Iterator[None]:
-    """Let `output_rate` be that of the weights alone, and multiply the first biases."""
+    """Apply `output_rate` to the weights alone, and multiply the initial biases."""
     rates, initial = vqc._Hybrid.learning_rates, vqc.initial
 
     def of_weights(model: Any) -> dict[str, float]:

@@ -193,7 +193,13 @@ class EpisodeLanes(LaneEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin a new episode in every lane; returns observations (L, n) and an empty dictionary."""
+        """Begin a new episode in every lane; returns observations (L, n) and an empty dictionary.
+
+        Raises
+        ------
+        qrlsuite.errors.OptionError
+            If `options` are given: there are none.
+        """
         if options:
             raise OptionError(f"environment '{self.name}': reset() takes no option, not {sorted(options)}")
         if seed is not None or not self.streams:
@@ -207,7 +213,15 @@ class EpisodeLanes(LaneEnv):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Take a step in every lane."""
+        """Take a step in every lane.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        gymnasium.error.InvalidAction
+            If an action is none of the space.
+        """
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
@@ -233,7 +247,13 @@ class EpisodeLanes(LaneEnv):
         return seen, np.where(running, rewards, 0.0), terminated, truncated, infos
 
     def state_dict(self) -> State:
-        """Return the episodes' state, lane-first."""
+        """Return the episodes' state, lane-first.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        """
         if not self._begun:
             raise ResetNeeded("call reset() before state_dict()")
         return {name: value.copy() for name, value in self._state().items()}
@@ -276,6 +296,11 @@ class OneLane(gymnasium.Env[Any, Any]):
     ----------
     lanes:
         With one lane. Flat observations have the shape of `unflattened_space` here, where there is one.
+
+    Raises
+    ------
+    ValueError
+        If there are several lanes.
     """
 
     metadata = {"render_modes": []}
@@ -301,7 +326,15 @@ class OneLane(gymnasium.Env[Any, Any]):
         return self._shown(observations), {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Take a step."""
+        """Take a step.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If no episode is running.
+        gymnasium.error.InvalidAction
+            If the action is none of the space.
+        """
         if not self._running:
             raise ResetNeeded("call reset() before step(): no episode is running")
         observations, rewards, terminated, truncated, infos = self.lanes.step(np.asarray(action)[None])
@@ -322,7 +355,13 @@ Lanes = TypeVar("Lanes", bound=LaneEnv)
 
 
 def require_lanes(envs: LaneEnv, lanes: type[Lanes]) -> Lanes:
-    """Return `envs` as the lanes that a reference policy looks into."""
+    """Return `envs` as the lanes that a reference policy looks into.
+
+    Raises
+    ------
+    TypeError
+        If they are other lanes.
+    """
     if not isinstance(envs, lanes):
         raise TypeError(f"the policy needs {lanes.__name__}, not {type(envs).__name__}")
     return envs

@@ -60,6 +60,12 @@ class GymLanes(LaneEnv):
         See `qrlsuite.normalization.Normalization`; for boxes, and a Dict or Tuple, only.
     observe:
         Places of the flattened values that are shown, in this order; None shows all.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If there is no such environment, a package that it needs is missing, it refuses its arguments, or its
+        actions or observations are not supported.
     """
 
     def __init__(
@@ -111,7 +117,13 @@ class GymLanes(LaneEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin a new episode in every lane; returns observations (L, n), and infos with masks, if there are any."""
+        """Begin a new episode in every lane; returns observations (L, n), and infos with masks, if there are any.
+
+        Raises
+        ------
+        qrlsuite.errors.OptionError
+            If `options` are given: they would be lost in a checkpoint.
+        """
         if options:
             raise OptionError(
                 f"environment '{self.env_id}' in lanes takes no options of reset(), not {options}: "
@@ -129,7 +141,17 @@ class GymLanes(LaneEnv):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Take `actions` (L, ...) in all lanes."""
+        """Take `actions` (L, ...) in all lanes.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        gymnasium.error.InvalidAction
+            If an action is not one of the space.
+        qrlsuite.errors.EnvironmentFailure
+            If an episode without a time limit gets too long to be checkpointed.
+        """
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
@@ -153,6 +175,11 @@ class GymLanes(LaneEnv):
 
         `seed` (L,) of the last reset, `actions` (L, capacity, ...) since then, -1 (of a box NaN) where there is none
         yet, and `observation` (L, n) as it came from the environment.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
         """
         if not self._begun:
             raise ResetNeeded("call reset() before state_dict()")
@@ -163,7 +190,13 @@ class GymLanes(LaneEnv):
         }
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Play the episodes of `state_dict` again; states may be sliced and joined along the lanes."""
+        """Play the episodes of `state_dict` again; states may be sliced and joined along the lanes.
+
+        Raises
+        ------
+        qrlsuite.errors.StoreError
+            If an array is missing or has another shape, or an environment does not repeat its steps.
+        """
         shapes = {"seed": (self.num_envs,), "actions": self._actions.shape, "observation": self._raw.shape}
         require_state(f"environment '{self.env_id}'", state, shapes)
         for lane in range(self.num_envs):
@@ -312,7 +345,13 @@ def _no_actions(space: spaces.Space[Any], lanes: int, capacity: int) -> NDArray[
 
 
 def specification(env_id: str) -> gymnasium.envs.registration.EnvSpec:
-    """Return Gymnasium's spec of an id; for `"module:Name-v0"` the module is imported first."""
+    """Return Gymnasium's spec of an id; for `"module:Name-v0"` the module is imported first.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If the module cannot be imported, or the id is unknown: with the nearest known one.
+    """
     module, _, name = env_id.rpartition(":")
     if module:
         try:
@@ -332,7 +371,13 @@ def specification(env_id: str) -> gymnasium.envs.registration.EnvSpec:
 
 
 def make(env_id: str, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
-    """Make one environment; Gymnasium's checks of every step are left out, for they cost more than the step."""
+    """Make one environment; Gymnasium's checks of every step are left out, for they cost more than the step.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If there is no such environment, a package that it needs is missing, or it refuses its arguments.
+    """
     specification(env_id)
     try:
         return gymnasium.make(env_id, disable_env_checker=True, **arguments)
@@ -387,6 +432,12 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     name:
         Name of a registered environment with that id, if the task is to use it with all its options and be named after
         it; its own time limit then holds.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If the environment cannot be made, the algorithms cannot act or observe in it, or every episode of random
+        actions has the same return and reaches all thresholds.
     """
     known = specification(env_id)
     options: dict[str, Any] = {"id": env_id}

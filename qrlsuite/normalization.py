@@ -47,6 +47,11 @@ class Normalization:
     ----------
     space:
         The box of normalized observations.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If the bounds are missing, infinite, of the wrong number or empty, or given to another kind.
     """
 
     def __init__(

@@ -68,7 +68,13 @@ def pack(generators: Sequence[np.random.Generator]) -> NDArray[np.uint64]:
 
 
 def unpack(states: NDArray[np.uint64]) -> list[np.random.Generator]:
-    """Return generators that continue where `pack` found them."""
+    """Return generators that continue where `pack` found them.
+
+    Raises
+    ------
+    ValueError
+        If the array is not (n, 13).
+    """
     if states.ndim != 2 or states.shape[1] != 13:
         raise ValueError(f"random stream states have shape {states.shape}, expected (n, 13)")
     generators = []

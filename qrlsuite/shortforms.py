@@ -98,7 +98,13 @@ def source_of(function: Any) -> Any:
 
 
 def shapes_of(function: Any) -> Mapping[str, Any]:
-    """Return the table `weight_shapes` beside a quantum function."""
+    """Return the table `weight_shapes` beside a quantum function.
+
+    Raises
+    ------
+    PluginError
+        If a parameter without default is not in it.
+    """
     source = source_of(function)
     shapes = source.__globals__.get(SHAPES, {})
     others = [each for each in _parameters(source) if each.name != inputs_of(function)]
@@ -215,6 +221,11 @@ def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
     ----------
     origin:
         The plugin's name, for the summary of a thing without a docstring.
+
+    Raises
+    ------
+    PluginError
+        If it is no short form, or a parameter cannot be an option; the message has the remedy.
     """
     kind = kind_of(thing)
     if kind is None:

@@ -170,10 +170,16 @@ class PairVerdict:
         pair, clauses = self.times, list[str]()
         if pair.direction not in _DECIDED:
             return clauses
-        unseen = [n for n, failed in zip(pair.n_runs, pair.failed) if not failed and n < _UNSEEN]
+        unseen = {
+            label: n
+            for label, n, failed in zip(self.labels, pair.n_runs, pair.failed)
+            if not failed and n < _UNSEEN
+        }
         if unseen:
+            fewest = min(unseen.values())
+            whose = "" if len(unseen) == len(self.labels) else f" of {next(iter(unseen))}"
             clauses.append(
-                f"none of {min(unseen)} seeds failed, but up to {share_text(most_failures(min(unseen)))} of others may"
+                f"none of {fewest} seeds{whose} failed, but up to {share_text(most_failures(fewest))} of others may"
             )
         less, more = sorted(pair.spreads)
         if more and any(more >= factor * less and min(pair.n_runs) <= most for factor, most in _SPREADS):

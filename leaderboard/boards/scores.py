@@ -192,7 +192,7 @@ class ScoreSection:
         return f"{labels[0]} has a {more} {self.called} than {labels[1]} ({self.clause((0, 1), named=False)})"
 
     def _decidable(self, pair: Pair) -> bool:
-        """Tell whether p of a pair may be trusted: that of spreads from 20 seeds on, see docs/error-rates.md."""
+        """Tell whether a pair has enough seeds for its p: for spreads 20 each, see docs/error-rates.md."""
         one, other = (len(self.entries[place].seeds) for place in pair)
         enough = min(one, other) >= MIN_RUNS if self.by == "spread" else True
         return enough and can_decide(one, other, self.alpha)

@@ -190,7 +190,7 @@ def _of_seeds(entry: EntryResults, count: int) -> str:
 
 
 def about(entries: Sequence[EntryResults]) -> list[str]:
-    """Return the notes below every verdict: those that may turn it, then how settings were found and what trained."""
+    """Return the notes below every verdict: first doubts, then how settings were found and what trained the entries."""
     return [*doubts(entries), *remarks(entries)]
 
 

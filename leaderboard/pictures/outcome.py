@@ -147,7 +147,7 @@ def draw_together(together: StudiesTogether) -> Figure:
             ends += _row(axes, len(names), pair)
             shown.append(pair)
             names.append(task)
-        ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *shared.judged[1]))
+        ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *shared.ratio.interval))
         axes.plot([low, high], [len(names)] * 2, color="black", lw=1.6)
         axes.plot([ratio], [len(names)], "*", color="black", ms=9)
         ends += [low, high]

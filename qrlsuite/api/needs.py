@@ -173,7 +173,7 @@ class StudyPower:
 
     @property
     def sentences(self) -> list[str]:
-        """Say the power of the pairs at the last look, and that of each claim at every look."""
+        """Say the power of the pairs at the last look, and the power of each claim at every look."""
         shares = ", ".join(f"{lead:.0%} fewer in {100 * each[-1]:.0f}" for lead, each in self.found.items())
         pairs = (
             f"power: of 100 such studies, this many find an entry that needs fewer steps than every other: {shares}; "

@@ -345,7 +345,16 @@ def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[C
 
 
 def require_computable(circuit: Circuit, backend: str) -> None:
-    """Refuse a circuit of a kind that a registered backend does not compute."""
+    """Refuse a circuit of a kind that a registered backend does not compute.
+
+    Raises
+    ------
+    UnknownNameError
+        If no backend has that name.
+    OptionError
+        For more qubits than the backend takes; for a mean-field approximation, or products of Paulis, where the backend
+        has none; for both together.
+    """
     from qrlsuite import registry, specs
 
     spec = registry.get(specs.CircuitBackendSpec, backend)

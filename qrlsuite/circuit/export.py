@@ -25,6 +25,11 @@ def export(circuit: Circuit, format: str) -> str:
     format:
         `qasm3`: OpenQASM 3 with every input and parameter as an `input`. `qiskit`: a Python program that makes a
         `QuantumCircuit` and its observables. `pennylane`: a Python program that makes a QNode.
+
+    Raises
+    ------
+    OptionError
+        For another format, or a mean-field approximation, which is no circuit.
     """
     if format not in FORMATS:
         raise OptionError(f"--format {format}: one of {', '.join(FORMATS)}{nearest(format, FORMATS)}")

@@ -39,6 +39,11 @@ def jacobians(
     -------
     array
         (N, O, P).
+
+    Raises
+    ------
+    OptionError
+        If the circuit is too large, or a number is not finite.
     """
     import torch
 

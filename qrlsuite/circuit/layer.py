@@ -152,7 +152,13 @@ class CircuitLayer(nn.Module):
         )
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Map (..., in_features) to (..., out_features), each in [-1, 1], in the type of the inputs."""
+        """Map (..., in_features) to (..., out_features), each in [-1, 1], in the type of the inputs.
+
+        Raises
+        ------
+        OptionError
+            If the last axis is not `in_features`, or a number is not finite.
+        """
         if inputs.dim() < 1 or inputs.shape[-1] != self.in_features:
             raise OptionError(
                 f"inputs have shape {tuple(inputs.shape)}: the last axis must be {self.in_features}, "

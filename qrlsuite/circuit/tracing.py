@@ -65,6 +65,15 @@ def trace(
         Size of the circuit, which the shapes in `weight_shapes` may depend on; None for as many as the function has.
     call:
         What is called in its place, with options of its own.
+
+    Raises
+    ------
+    PluginError
+        If `weight_shapes` lacks a weight.
+    OptionError
+        For a size that the function does not have.
+    CircuitError
+        For an angle, gate or measurement that a `Circuit` cannot have.
     """
     import pennylane as qml
 

@@ -88,7 +88,7 @@ class Clock:
 
     @property
     def settled(self) -> bool:
-        """Whether `pace` is that of epochs."""
+        """Whether whole epochs were timed, and `pace` is not of rounds."""
         return len(self.marks) >= 2
 
     @property

@@ -215,7 +215,7 @@ def counts(name: str) -> bool:
 
 
 def digest(name: str, content: bytes) -> str:
-    """Return the SHA-256 of a file; of a Python file, that of its tree."""
+    """Return the SHA-256 of a file's bytes; of a Python file, of its syntax tree."""
     return _digest(content, _tree(content, name))
 
 

@@ -80,6 +80,11 @@ def outperformance(
         The entries; their names must differ for a ranking.
     grid, rule, resampling, horizon:
         As in `qrlsuite.statistics.compare.compare`.
+
+    Raises
+    ------
+    OptionError
+        As `compare`, naming the pair.
     """
     chosen = rule or IntervalRule()
     size = len(entries)

@@ -66,6 +66,11 @@ def bootstrap_interval(
     -------
     numpy.ndarray
         With all N runs: the percentiles, widened to contain S_hat.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range, or `n_runs` exceeds N.
     """
     values = checked(curves, relative=grid.is_relative)
     steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
@@ -133,7 +138,13 @@ def check_percentiles(percentiles: tuple[float, float]) -> tuple[float, float]:
 def draw_epochs(
     curves: Curve, grid: Grid, n_resamples: int = RESAMPLES, seed: int = 0, n_runs: int | None = None
 ) -> EpochDraws:
-    """Return, shape (E, D, R), the epochs below delta of every resample of checked curves (N, T)."""
+    """Return, shape (E, D, R), the epochs below delta of every resample of checked curves (N, T).
+
+    Raises
+    ------
+    OptionError
+        If `n_resamples` or `n_runs` is not a positive integer, or `n_runs` exceeds N.
+    """
     available = curves.shape[0]
     runs = available if n_runs is None else whole(n_runs, "n_runs", at_least=1)
     if runs > available:

@@ -236,6 +236,11 @@ def judge_cells(
     tuple
         Signs (M, E, D), +1 where `first` needs significantly fewer samples; and (M, E, D) where neither does and both
         intervals end at the horizon: too few steps to tell.
+
+    Raises
+    ------
+    OptionError
+        If the rule answers something else than signs.
     """
     shape, against = first.grid.shape, getattr(rule, "against", None)
     if against is not None:

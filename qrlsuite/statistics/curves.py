@@ -26,6 +26,12 @@ def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") 
         Whether scores are fractions of a known maximum, in [0, 1].
     name:
         Name of the curves in an error message.
+
+    Raises
+    ------
+    OptionError
+        If there is no run or no epoch, the shape is not (N, T), a value is not a number, or a relative score
+        lies outside [0, 1].
     """
     try:
         values = np.asarray(curves)
@@ -108,7 +114,13 @@ class LearningCurves:
         return int(self.values.shape[1]) * self.steps_per_epoch
 
     def cut(self, horizon: int) -> LearningCurves:
-        """Return the same runs up to a horizon in environment steps."""
+        """Return the same runs up to a horizon in environment steps.
+
+        Raises
+        ------
+        OptionError
+            If the horizon is not a whole number of this entry's epochs, or beyond its last one.
+        """
         horizon = whole(horizon, "horizon", at_least=1)
         if horizon % self.steps_per_epoch:
             raise OptionError(
@@ -127,7 +139,13 @@ class LearningCurves:
 
 
 def common_horizon(first: LearningCurves, second: LearningCurves, horizon: int | None = None) -> int:
-    """Return the steps to which two entries are cut: the shortest of both and of an optional limit."""
+    """Return the steps to which two entries are cut: the shortest of both and of an optional limit.
+
+    Raises
+    ------
+    OptionError
+        If it is not a whole number of epochs for both.
+    """
     shortest = min(first.horizon, second.horizon)
     if horizon is not None:
         shortest = min(shortest, whole(horizon, "horizon", at_least=1))

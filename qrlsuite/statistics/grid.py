@@ -31,7 +31,13 @@ Goal = Literal["above", "below"]
 
 
 def whole(value: object, name: str, *, at_least: int) -> int:
-    """Return an integer option as an `int`."""
+    """Return an integer option as an `int`.
+
+    Raises
+    ------
+    OptionError
+        If it is not an integer, or smaller than `at_least`.
+    """
     if isinstance(value, (bool, np.bool_)):
         raise OptionError(f"{name} = {value!r} is not an integer")
     try:
@@ -48,6 +54,11 @@ def exact(value: object, name: str) -> Decimal:
 
     A float32 is read by its own shortest form, so `numpy.float32(0.3)` means 0.3; the noise of
     `numpy.arange(0.3, 1, 0.1)` disappears in the rounding.
+
+    Raises
+    ------
+    OptionError
+        If it is not a finite number.
     """
     try:
         number = _DIGITS.create_decimal(str(value))

@@ -51,7 +51,13 @@ ENUMERATED = 100_000
 
 
 def relabelings_for(level: float) -> int:
-    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands."""
+    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands.
+
+    Raises
+    ------
+    OptionError
+        If the level is outside (0, 1), or needs more than `MOST`.
+    """
     needed = 20 / check_probability(level, "level")
     if needed > MOST:
         raise OptionError(

@@ -213,7 +213,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class SequentialDesign:
-    """A study as it is fixed before the first run: pairs, looks, and error.
+    """What a study fixes before its first run: pairs, claims, looks, and error.
 
     Attributes
     ----------

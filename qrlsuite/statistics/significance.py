@@ -45,6 +45,11 @@ class Resampling:
         Number of resamples R behind an interval.
     seed:
         Every entry is resampled from this seed, so its interval does not depend on whom it is compared with.
+
+    Raises
+    ------
+    OptionError
+        If one of them is not an integer in its range.
     """
 
     n_resamples: int = RESAMPLES

@@ -85,6 +85,11 @@ def slower(entry: LearningCurves, factor: float) -> LearningCurves:
 
     A run's value after epoch t is the original's after epoch t / factor, between epochs interpolated linearly,
     before the first the first.
+
+    Raises
+    ------
+    OptionError
+        If the factor is below 1.
     """
     if not 1 <= factor < np.inf:
         raise OptionError(f"factor = {factor!r} is not a finite number >= 1")
@@ -168,6 +173,11 @@ def decision_rates(
     """Play a sequential design many times, its entries drawn from as many models, in the design's order.
 
     All studies are played together; `tick` is called for each of them at the end.
+
+    Raises
+    ------
+    OptionError
+        If there are not as many models as entries, or an argument is out of its range.
     """
     if len(models) != len(design.entries):
         raise OptionError(f"{len(models)} models for the {len(design.entries)} entries of the design")

@@ -6,7 +6,6 @@ first look count here: every pair has them, whatever they showed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -50,16 +49,17 @@ class SharedPair:
     ratio: MeanRatio
 
     @property
-    def judged(self) -> tuple[float, tuple[float, float]]:
-        """The p and the interval of the verdict: over the given tasks, or where they are many, over such tasks."""
-        ratio = self.ratio
-        few = math.isnan(ratio.drawn_p)
-        return (ratio.p, ratio.interval) if few else (ratio.drawn_p, ratio.drawn_interval)
-
-    @property
     def verdict(self) -> str:
         """Which entry needs fewer steps on average over the tasks, if that is significant."""
-        if self.judged[0] > ALPHA:
+        return self._verdict(self.ratio.p)
+
+    @property
+    def drawn_verdict(self) -> str:
+        """Which entry needs fewer steps on average over tasks like these, if that is significant."""
+        return self._verdict(self.ratio.drawn_p)
+
+    def _verdict(self, p: float) -> str:
+        if not p <= ALPHA:
             return "not told apart"
         return f"{self.first if self.ratio.difference > 0 else self.second} needs fewer"
 
@@ -122,6 +122,13 @@ class StudiesTogether(Shown):
                 cell=drawn,
             ),
             Column("drawn_p", lambda pair: pair.ratio.drawn_p, p_text, head="p over such tasks"),
+            Column(
+                "drawn_verdict",
+                lambda pair: pair.drawn_verdict,
+                str,
+                head="verdict over such tasks",
+                words=True,
+            ),
         )
 
         def on(place: int, task: str) -> Column[SharedPair]:
@@ -171,12 +178,12 @@ class StudiesTogether(Shown):
             f"({', '.join(map(str, self.seeds))}), which no early stop can bias; mean: of the ratios, over these "
             f"{len(self.tasks)} tasks, with a 95% interval by itself; one left out: the least and the greatest mean "
             f"without one of the tasks; verdict: error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). "
-            + (
-                "Over such tasks: as if these were drawn at random from many; the verdict is about those."
-                if len(self.studies) >= DRAWN
-                else "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
-            )
+            "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
         )
+        if len(self.studies) >= DRAWN:
+            yield Text(
+                "over such tasks: if these tasks were drawn at random from many, what follows for the many."
+            )
         alpha = max(each.study.looks.alpha for each in self.studies)
         for claim, tasks in self.claims.items():
             where = f"established on {', '.join(tasks) or 'none'}"
@@ -233,14 +240,20 @@ def together(studies: Sequence[State]) -> StudiesTogether:
 
 def _claims(studies: Sequence[State]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each claim that all studies make, and the tasks on which it holds."""
-    by_study = [{each.claim.sentence: each for each in state.decision.claims} for state in studies]
-    for claim in by_study[0]:
-        if all(claim in claims for claims in by_study):
-            decided = [claims[claim] for claims in by_study]
+    by_study = [
+        {
+            (each.claim.entry, frozenset(each.claim.rivals), each.claim.at_most): each
+            for each in state.decision.claims
+        }
+        for state in studies
+    ]
+    for key, first in by_study[0].items():
+        if all(key in claims for claims in by_study):
+            decided = [claims[key] for claims in by_study]
             count = max(len(studies), *(each.claim.tasks for each in decided))
             holds = holm_claims([(state.study.design, each) for state, each in zip(studies, decided)], count)
             tasks = tuple(state.study.task for state, held in zip(studies, holds) if held)
-            yield f"on at least one of {count} tasks {claim}", tasks
+            yield f"on at least one of {count} tasks {first.claim.sentence}", tasks
 
 
 def _shared(studies: Sequence[State]) -> Iterator[tuple[str, str, str]]:

@@ -288,7 +288,7 @@ def parameters(docstring: str | None) -> set[str]:
 
 
 def taken(node: ast.AST) -> set[str]:
-    """Return the names of what a function takes, or a class when it is made: its fields, where it has no `__init__`."""
+    """Return the names of a function's parameters; of a class, those of `__init__`, else its fields."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         a = node.args
         every = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]

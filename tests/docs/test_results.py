@@ -1,4 +1,4 @@
-"""The pages of results are made of what is published; README, findings and judgments say the same."""
+"""The pages of results are made from the published files; README, findings and judgments agree with them."""
 
 from __future__ import annotations
 

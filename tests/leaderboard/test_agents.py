@@ -108,7 +108,7 @@ def test_curves_alone_are_published_on_request_and_say_what_to_type(folder: Path
 
 
 def test_agents_are_added_to_an_entry_with_the_same_curves(folder: Path, tmp_path: Path) -> None:
-    """Of fewer seeds, too; what was published of the curves stays as it is."""
+    """Agents of fewer seeds are published, too, and the published curves do not change."""
     store = runs_of(tmp_path)
     bare = export(read(store), tmp_path / "bare", agents=False)
     before = {path.name: path.read_bytes() for path in bare.iterdir()}

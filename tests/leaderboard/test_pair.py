@@ -102,7 +102,7 @@ def test_what_so_few_seeds_cannot_know_is_a_clause() -> None:
     )
     failing = entry("failing", [18, 20, 100, 19, 22])
     assert (
-        "; none of 8 seeds failed, but up to 31% of others may"
+        "; none of 8 seeds of quick failed, but up to 31% of others may"
         in compare_entries(failing, entry("quick", spread(2, 8))).sentence
     )
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics import Grid, LearningCurves, SequentialDesign, decide
 from qrlsuite.statistics.planning import claim_chances
 from qrlsuite.statistics.sequential import Claim, ClaimDecision, holm_claims, next_claim
+from qrlsuite.studies import together
+from qrlsuite.studies.state import State
 
 BEATS = Claim("a", ("b", "c"))
 AT_MOST = Claim("a", ("b", "c"), at_most=0.1)
@@ -73,6 +77,20 @@ def test_holm_goes_on_with_the_tasks_that_are_left() -> None:
     assert holm_claims(decided, 3) == [True] * 3
     assert holm_claims(decided, 6) == [False] * 3, "of tasks whose studies are not given nothing is known"
     assert holm_claims(decided[::2], 3) == [False, False]
+
+
+def test_claims_of_several_studies_are_one_claim_whatever_the_order_of_rivals() -> None:
+    design = planned(FASTER, looks=(40,))
+
+    def state(task: str, *rivals: str) -> State:
+        decided = ClaimDecision(Claim("a", rivals), ((0.001, 0.001),), ((0, 0),), 40)
+        study = SimpleNamespace(design=design, task=task)
+        return cast("State", SimpleNamespace(study=study, decision=SimpleNamespace(claims=(decided,))))
+
+    [(claim, tasks)] = together._claims([state("one", "b", "c"), state("two", "c", "b")])
+    assert claim == "on at least one of 2 tasks a needs fewer steps than each of b, c"
+    assert tasks == ("one", "two")
+    assert not [*together._claims([state("one", "b", "c"), state("two", "b")])]
 
 
 def test_an_open_claim_keeps_its_entries_and_all_rivals_are_beaten_at_one_look() -> None:

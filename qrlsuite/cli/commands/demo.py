@@ -48,7 +48,9 @@ def demo(runs: RunsOption = Path("runs")) -> None:
     )
     for first, second in combinations(trained, 2):
         typer.echo(f"- {api.compare(first, second).pair.said}")
-    typer.echo("Next, a circuit of your own: write it in ring.py, as README does, and add --plugin ring.py")
+    typer.echo(
+        "Next, a circuit of your own: write it in swirl.py, as docs/your-circuit.md does, and add --plugin swirl.py"
+    )
 
 
 def _do(*words: str, runs: Path) -> int | None:
