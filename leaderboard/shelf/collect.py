@@ -389,13 +389,13 @@ def read(store: EntryStore) -> EntryResults | None:
     return read_entry(store)
 
 
-def read_entry(store: EntryStore) -> EntryResults | None:
-    """Read one entry from its runs; None if no run has finished an epoch. Tuning seeds do not count.
+def read_entry(store: EntryStore, tuning: bool = False) -> EntryResults | None:
+    """Read one entry from its runs; None if no run has finished an epoch. Seeds of tuning count alone, or not at all.
 
     A seed with a damaged file, in the wrong folder, or of other code is left out; other seeds are read.
     """
     record = store.record()
-    runs, refused = _readable(store, current(record))
+    runs, refused = _readable(store, current(record), tuning)
     if not runs:
         if refused:
             raise StoreError("; ".join(refused))
@@ -416,12 +416,14 @@ def read_entry(store: EntryStore) -> EntryResults | None:
     return found
 
 
-def _readable(store: EntryStore, task_file: TaskFile) -> tuple[list[SeedRun], list[str]]:
+def _readable(
+    store: EntryStore, task_file: TaskFile, tuning: bool = False
+) -> tuple[list[SeedRun], list[str]]:
     """Return the runs with an epoch or more, and one line for each seed that does not count and why."""
     runs: dict[int, SeedRun] = {}
     refused, held = [], codes.of(store)
     for seed in store.seeds():
-        if seed >= TUNING_SEEDS:
+        if (seed >= TUNING_SEEDS) != tuning:
             continue
         try:
             run = store.seed(seed).read()

@@ -17,8 +17,9 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import ranked
-from qrlsuite.leaderboard.shelf.collect import Selection, collect
+from qrlsuite.leaderboard.shelf.collect import Selection, collect, read_entry
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import hours_text
 from qrlsuite.statistics import MIN_RUNS, LearningCurves, SmoothedRuns
 from qrlsuite.statistics.curves import common_horizon
@@ -26,6 +27,7 @@ from qrlsuite.statistics.permutation import with_half_epoch
 from qrlsuite.statistics.planning import LADDER, Need, chances, claim_chances, runs_needed, runs_to_detect
 from qrlsuite.statistics.times import mean_time, times_below
 from qrlsuite.studies.looks import Study
+from qrlsuite.tuning.search import FOLDER
 
 SLOWER = (0.10, 0.25, 0.50)
 PILOT = 10
@@ -158,7 +160,8 @@ class StudyPower:
     spread:
         Standard deviation of a run's steps over their mean, as `pilot` has it.
     pilot:
-        The study's entry with most seeds, or one of its task where none of its own has `PILOT` seeds.
+        The study's entry with the middle spread, trained or searched; an entry of its task where none has `PILOT`
+        seeds.
     seeds:
         The pilot's number of seeds.
     claims:
@@ -188,27 +191,16 @@ class StudyPower:
 
 
 def study_power(study: Study) -> StudyPower | None:
-    """Return a study's power, from seeds that are stored or published; None where its task has no `PILOT` of them."""
+    """Return a study's power, from seeds that are searched, stored or published; None where its task has too few."""
     collected, _ = collect(Selection(study.runs, published=True, tasks=(study.task,)))
-    own = {entry.label for entry in study.entries.values()}
-    task_hash = next(iter(study.entries.values())).task.hash
-    pilots = [
-        each
-        for each in collected
-        if each.task_hash == task_hash
-        and len(each.seeds) >= PILOT
-        and each.curves.shape[1] >= study.epochs
-        and np.isfinite(each.curves).all()
-    ]
+    names = {entry.name for entry in study.entries.values()}
+    tried = [EntryStore(study.runs / FOLDER / study.task / name) for name in sorted(names)]
+    searched = [read_entry(store, tuning=True) for store in tried if store.path.is_dir()]
+    own = [*filter(None, searched), *(each for each in collected if each.record.name in names)]
+    pilots = _spreads(own, study) or _spreads(collected, study)
     if not pilots:
         return None
-    pilot = max(pilots, key=lambda each: (each.record.label in own, len(each.seeds), each.name))
-    curves = ranked.learning_curves(pilot).cut(study.epochs * pilot.steps_per_epoch)
-    times = times_below(curves.values, study.grid, curves.steps_per_epoch)
-    numbers = with_half_epoch(times, curves.steps_per_epoch).sum(axis=-1)
-    spread = float(numbers.std(ddof=1) / numbers.mean())
-    if not spread:
-        return None
+    spread, pilot = pilots[len(pilots) // 2]
     design = study.design
     found = {lead: chances(design, spread, lead) for lead in SLOWER}
     claims = {
@@ -220,6 +212,20 @@ def study_power(study: Study) -> StudyPower | None:
         for lead in (SLOWER if claim.at_most is None else (0.0,))
     }
     return StudyPower(found, spread, pilot.label, len(pilot.seeds), claims)
+
+
+def _spreads(entries: Sequence[EntryResults], study: Study) -> list[tuple[float, EntryResults]]:
+    """Return how much the seeds of entries with `PILOT` or more differ on the study's task, the smallest first."""
+    task_hash = next(iter(study.entries.values())).task.hash
+    spreads = []
+    for entry in entries:
+        long = entry.task_hash == task_hash and entry.curves.shape[1] >= study.epochs
+        if len(entry.seeds) >= PILOT and long and np.isfinite(entry.curves).all():
+            curves = ranked.learning_curves(entry).cut(study.epochs * entry.steps_per_epoch)
+            times = times_below(curves.values, study.grid, curves.steps_per_epoch)
+            numbers = with_half_epoch(times, curves.steps_per_epoch).sum(axis=-1)
+            spreads.append((float(numbers.std(ddof=1) / numbers.mean()), entry))
+    return sorted((each for each in spreads if each[0]), key=lambda each: each[0])
 
 
 def power_lines(power: StudyPower | None) -> list[str]:

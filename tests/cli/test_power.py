@@ -18,10 +18,10 @@ from tests.conftest import TINY
 EPOCHS = 20
 
 
-def put(width: int, *starts: int, epochs: int = EPOCHS) -> None:
+def put(width: int, *starts: int, epochs: int = EPOCHS, runs: str = "runs", first: int = 0) -> None:
     """Leave an entry of finished runs that reach every threshold at some epoch, 0.5 seconds an epoch."""
-    store = EntryStore.create(Path("runs"), resolve("tiny.toml", f"mlp width={width}"))
-    for seed, start in enumerate(starts):
+    store = EntryStore.create(Path(runs), resolve("tiny.toml", f"mlp width={width}"))
+    for seed, start in enumerate(starts, first):
         folder = store.seed(seed)
         rows = [{"epoch": t, "scores": [0.5 * (t >= start)] * 5} for t in range(1, epochs + 1)]
         folder.path.mkdir()
@@ -78,7 +78,8 @@ def test_a_weak_pilot_is_marked_and_the_shorter_horizon_said() -> None:
 
 def test_a_study_that_has_not_begun_says_the_power_of_its_claims() -> None:
     """Runs that differ by a tenth: half of the steps is found at the first look."""
-    put(16, *([9, 10, 11] * 10))
+    put(4, *([2, 10, 18] * 10))  # on a board; the spread of the study's own entry in its search counts
+    put(8, *([9, 10, 11] * 10), runs="runs/tuning", first=1_100_000)
     say("study", "new", "w.toml", "mlp width=16", "mlp width=8", "--task", "tiny.toml", "--epochs", "20")
     head, entries = Path("w.toml").read_text().split("\n[[entries]]\n", 1)
     claim = '\n[[looks.claims]]\nentry = "mlp width=16"\nrivals = ["mlp width=8"]\n'
