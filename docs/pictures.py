@@ -109,7 +109,7 @@ PICTURES: dict[str, Picture] = {
     ),
     **{
         f"study-{name}.png": Plot(f"plot pairs --study {name}", (f"plans/{name}", f"plans/{name}/*/*"))
-        for name in published_studies.names()
+        for name in published_studies.names(begun=True)
     },
     "diagnose-circuit.png": Plot("diagnose ansatz iqp qubits=2:16:2", ()),
     "diagnose-agents.png": Plot(

@@ -60,7 +60,7 @@ after 20 seeds, after 40, and so on. A [board](../compare.md) compares all entri
 @cache
 def names() -> tuple[str, ...]:
     """Return the published studies."""
-    return tuple(published_studies.names())
+    return tuple(published_studies.names(begun=True))
 
 
 def judged(name: str) -> tuple[str, str]:

@@ -29,9 +29,9 @@ PUBLISHED = PLANS
 """The studies with looks that come with the suite."""
 
 
-def names() -> list[str]:
-    """Return the names of the studies that come with the suite."""
-    return sorted(path.parent.name for path in PUBLISHED.glob(f"*/{FILE}"))
+def names(begun: bool = False) -> list[str]:
+    """Return the names of the studies that come with the suite: all, or only those that have taken a look."""
+    return sorted(path.parent.name for path in PUBLISHED.glob(f"*/{LOG if begun else FILE}"))
 
 
 def folder_of(name: str) -> Path | None:

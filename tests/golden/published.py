@@ -64,12 +64,16 @@ NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?%?|\.\d+")
 
 
 def _names(folder: str) -> list[str]:
-    """Return what is in a folder of published results: tasks with entries, or studies."""
-    return sorted(path.name for path in (ROOT / "leaderboard" / folder).iterdir())
+    """Return what is in a folder of published results: tasks with entries, or studies that have taken a look."""
+    paths = (ROOT / "leaderboard" / folder).iterdir()
+    return sorted(path.name for path in paths if folder != "plans" or (path / "looks.jsonl").is_file())
 
 
 def _studies() -> list[str]:
-    return [study["name"] for study in answer("list", "studies")]
+    plans = {path.parent.name for path in (ROOT / "leaderboard" / "plans").glob("*/plan.toml")} - {
+        *_names("plans")
+    }
+    return [study["name"] for study in answer("list", "studies") if study["name"] not in plans]
 
 
 def _boards() -> Iterator[str]:
