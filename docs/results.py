@@ -25,9 +25,11 @@ from tables import (
     verdicts,
 )
 
+from qrlsuite.api.needs import study_power
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.text import hours_text
+from qrlsuite.studies.state import State
 
 PAGES = ROOT / "docs" / "results"
 JUDGMENTS = ROOT / "leaderboard" / "judgments"
@@ -115,10 +117,29 @@ def of_study(name: str) -> str:
         _code(f"qrlsuite show {name}", f"qrlsuite plot pairs --study {name}"),
         markdown(verdicts(outcome)),
         design + ended,
+        *claims(outcome),
         _folded("Every entry", f"{cost}\n\n{markdown(entries(outcome))}"),
         _folded("What the searches found", markdown(found) if len(found) > 1 else ""),
         _folded("Notes", notes),
     )
+
+
+def claims(outcome: State) -> Iterator[str]:
+    """Say what a study claims, what is known of it, and how often such a study establishes it."""
+    decided = outcome.decision.claims
+    power = study_power(outcome.study) if decided else None
+    if power is None:
+        return
+    rows = [(each.claim.sentence, each.verdict) for each in decided]
+    yield markdown([("claim", "after the last look"), *rows])
+    yield (
+        f"Each claim has an error of {outcome.study.looks.alpha:g} of its own, on one side. Of 100 such studies, this "
+        f"many establish it by each look, if the seeds' steps spread by {power.spread:.0%} of their mean, as in "
+        f"`{power.pilot}`:"
+    )
+    looks = [f"{look} seeds" for look in outcome.study.looks.looks]
+    found = [(claim, *(f"{100 * each:.0f}" for each in shares)) for claim, shares in power.claims.items()]
+    yield markdown([("claim", *looks), *found])
 
 
 def searches(task: str) -> Iterator[Sequence[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -192,12 +192,13 @@ class StudyPower:
 
 def study_power(study: Study) -> StudyPower | None:
     """Return a study's power, from seeds that are searched, stored or published; None where its task has too few."""
-    collected, _ = collect(Selection(study.runs, published=True, tasks=(study.task,)))
-    names = {entry.name for entry in study.entries.values()}
-    tried = [EntryStore(study.runs / FOLDER / study.task / name) for name in sorted(names)]
-    searched = [read_entry(store, tuning=True) for store in tried if store.path.is_dir()]
-    own = [*filter(None, searched), *(each for each in collected if each.record.name in names)]
-    pilots = _spreads(own, study) or _spreads(collected, study)
+    keys = {(entry.task.name, entry.name) for entry in study.entries.values()}
+    searches = [EntryStore(study.runs / FOLDER / task / name) for task, name in sorted(keys)]
+    own = [read_entry(store, tuning=True) for store in searches if store.path.is_dir()]
+    own += collect(Selection(study.runs, published=True, only=keys))[0]
+    pilots = _spreads(filter(None, own), study) or _spreads(
+        collect(Selection(study.runs, published=True, tasks=(study.task,)))[0], study
+    )
     if not pilots:
         return None
     spread, pilot = pilots[len(pilots) // 2]
@@ -214,7 +215,7 @@ def study_power(study: Study) -> StudyPower | None:
     return StudyPower(found, spread, pilot.label, len(pilot.seeds), claims)
 
 
-def _spreads(entries: Sequence[EntryResults], study: Study) -> list[tuple[float, EntryResults]]:
+def _spreads(entries: Iterable[EntryResults], study: Study) -> list[tuple[float, EntryResults]]:
     """Return how much the seeds of entries with `PILOT` or more differ on the study's task, the smallest first."""
     task_hash = next(iter(study.entries.values())).task.hash
     spreads = []
