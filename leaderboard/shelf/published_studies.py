@@ -80,7 +80,7 @@ def read(folder: Path, labels: bool = True) -> State:
         for seed in found.seeds:
             study.require_own(name, seed, found.record.plan)
         trained[name], hours[name] = dict(zip(found.seeds, found.curves)), float(sum(found.hours))
-    return study.state(trained, hours, begun=True)
+    return study.state(trained, hours, begun=any(trained.values()))
 
 
 def noted(state: State) -> State:
@@ -104,7 +104,7 @@ def collected(selection: Selection) -> tuple[list[State], list[str]]:
     tasks = selection.tasks
     outcomes, refused = in_folder(selection.runs, tasks)
     known = {outcome.study.hash for outcome in outcomes}
-    for name in names() if selection.published else []:
+    for name in names(begun=True) if selection.published else []:
         try:
             outcome = read(PUBLISHED / name, labels=False)
         except QrlSuiteError as error:

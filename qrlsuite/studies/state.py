@@ -379,7 +379,9 @@ class State(Shown):
         for line in dict.fromkeys(line for lines in unusable.values() for line in lines):
             yield f"note: {line}: {', '.join(name for name, lines in unusable.items() if line in lines)}"
         for level in self.levels():
-            equal = "" if level["equal"] is None else f"; equal at p <= {level['equal']:.4f} on both sides"
+            equal = (
+                f"; equal at p <= {level['equal']:.4f} on both sides" if (level["equal"] or 0) >= 1e-4 else ""
+            )
             yield (
                 f"look at {level['seeds']} seeds: different at p <= {level['differs']:.4f}"
                 + (" while all pairs are open" if family > 1 else "")
