@@ -1,6 +1,6 @@
 """Continuous actions and memory, side by side with Stable-Baselines3 and sb3-contrib at equal settings.
 
-    pip install 'qrlsuite[bench]'
+    pip install '.[bench]'
     python benchmarks/continuous.py [--algorithms sac td3 ppo hill lstm] [--seeds 5] [--epochs 10] [--json out.json]
 
 SAC, TD3 and PPO learn Pendulum-v1. Every agent has the same network (two hidden layers of 64 rectifiers, torch's own

@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO with a circuit as its features extractor: our layer beside PennyLane's.
 
-    pip install 'qrlsuite[bench]' && python benchmarks/layer.py --qubits 4 6 8
+    pip install '.[bench]' && python benchmarks/layer.py --qubits 4 6 8
 
 The work is the same: CartPole, the same circuit (`cz`, `rot`, 4 layers) with the same initial parameters behind a
 linear layer, `--steps` environment steps and 4 passes over them in batches of 64. The peers are `qrlsuite.layer` on the

@@ -383,7 +383,7 @@ def make(env_id: str, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
         return gymnasium.make(env_id, disable_env_checker=True, **arguments)
     except DependencyNotInstalled as error:
         box2d = "box2d" in str(error).lower()
-        advice = "pip install 'qrlsuite[box2d]'" if box2d else str(error)
+        advice = "pip install 'gymnasium[box2d]'" if box2d else str(error)
         lacks = " needs Box2D, which is not installed" if box2d else ""
         raise OptionError(f"environment '{env_id}'{lacks}: {advice}") from error
     except ModuleNotFoundError as error:

@@ -380,5 +380,5 @@ def check_version(distribution: metadata.Distribution | None, version: str | Non
     if not SpecifierSet(needs).contains(ours, prereleases=True):
         raise PluginError(
             f"distribution '{distribution.name}' {distribution.version} requires qrlsuite{needs}, and this is "
-            f"qrlsuite {ours}: pip install --upgrade {distribution.name}, or pip install 'qrlsuite{needs}'"
+            f"qrlsuite {ours}: upgrade {distribution.name}, or install a version of qrlsuite that fits"
         )

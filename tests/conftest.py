@@ -61,9 +61,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     """A running headless Chromium, the installed one, never a download; skips where there is none."""
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="needs playwright: pip install 'qrlsuite[dev]'"
-    )
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[dev]'")
     path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if path is None:
         pytest.skip(f"needs a browser on the path ({', '.join(BROWSERS)}): apt-get install chromium")

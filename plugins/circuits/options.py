@@ -97,8 +97,8 @@ class QiskitOptions:
         Literal["auto", "adjoint", "reverse", "parameter-shift", "lin-comb", "spsa"],
         Field(
             description="auto: where exact, adjoint (the same function, differentiated by the native simulator); with "
-            "shots or noise, parameter-shift. spsa: a guess from two circuits. reverse and lin-comb (linear "
-            "combination of unitaries) are Qiskit's own: exact and slow"
+            "shots or noise, parameter-shift. spsa: a guess from two circuits. lin-comb (linear combination of "
+            "unitaries) is Qiskit's own: exact and slow. reverse: of results of earlier versions only"
         ),
     ] = "auto"
     shots: Annotated[

@@ -65,7 +65,7 @@ SIMULATORS = (
 """Words in the names of devices that only simulate; any other device is taken for hardware."""
 
 PACKAGES = {
-    "braket": "'qrlsuite[braket]'",
+    "braket": "amazon-braket-pennylane-plugin",
     "cirq": "pennylane-cirq",
     "ionq": "pennylane-ionq",
     "lightning.gpu": "pennylane-lightning-gpu",

@@ -107,7 +107,7 @@ class QiskitBackend:
             values: Tensor = _Adjoint.apply(self, names, *exact)  # type: ignore[no-untyped-call]
             return values.to(inputs)
         rotations = self._rotations(exact[0], dict(zip(names, exact[1:])))
-        if self.gradient in ("reverse", "lin-comb"):
+        if self.gradient == "lin-comb":
             values = _Network.apply(rotations.reshape(-1, S * B), self.network())  # type: ignore[no-untyped-call]
             values = values.reshape(S, B, -1)
         elif self.draws and (self._runtime is None or rotations.requires_grad):
@@ -130,9 +130,7 @@ class QiskitBackend:
         from qiskit_machine_learning.primitives import QMLEstimator
 
         primitive = QMLEstimator(default_precision=0.0)
-        if self.gradient == "reverse":
-            gradient = importlib.import_module("qiskit_algorithms.gradients").ReverseEstimatorGradient()
-        elif self.gradient == "lin-comb":
+        if self.gradient == "lin-comb":
             gradient = LinCombEstimatorGradient(primitive)
         else:
             gradient = ParamShiftEstimatorGradient(primitive)
@@ -256,15 +254,17 @@ def _gradient(options: QiskitOptions) -> str:
     if options.readout_error > 0 and options.noise_model != "depolarizing":
         raise OptionError(f"readout_error = {options.readout_error:g} needs noise_model = 'depolarizing'")
     exact = options.shots is None and options.noise_model is None
+    if options.gradient == "reverse":
+        raise OptionError(
+            "gradient = 'reverse' of qiskit-algorithms is no longer there: 'adjoint' gives the same slopes, faster"
+        )
     if options.gradient == "auto":
         return "adjoint" if exact else "parameter-shift"
-    if options.gradient in ("adjoint", "reverse", "lin-comb") and not exact:
+    if options.gradient in ("adjoint", "lin-comb") and not exact:
         raise OptionError(
             f"gradient = '{options.gradient}' needs exact states, without shots and noise; use 'parameter-shift', "
             "'spsa' or 'auto'"
         )
-    if options.gradient == "reverse":
-        _package("qiskit_algorithms", "gradient = 'reverse'", "qiskit-algorithms")
     return options.gradient
 
 
@@ -286,7 +286,7 @@ def _check_device(options: QiskitOptions) -> None:
 
 def _device(name: str, qubits: int) -> Any:
     """Return an IBM device, or a fake one, by its name."""
-    _package("qiskit_ibm_runtime.executor_estimator", f"device = '{name}'", "'qrlsuite[ibm]'")
+    _package("qiskit_ibm_runtime.executor_estimator", f"device = '{name}'", "qiskit-ibm-runtime")
     if fake_device(name):
         return _fake_backend(name, qubits, "device")
     return open_device(name)

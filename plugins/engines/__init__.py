@@ -33,7 +33,7 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
             summary="Workers of a Dask cluster whose machines see the results folder",
             factory="qrlsuite.plugins.engines.dask:DaskEngine",
             options="qrlsuite.plugins.engines.dask:DaskOptions",
-            extras={"distributed": "pip install 'qrlsuite[dask]'"},
+            extras={"distributed": "pip install distributed"},
             remote=True,
         )
     )
@@ -43,7 +43,7 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
             summary="A SLURM job array: submit and leave; requeued at the time limit, see `qrlsuite runs`",
             factory="qrlsuite.plugins.engines.slurm:SlurmEngine",
             options="qrlsuite.plugins.engines.slurm:SlurmOptions",
-            extras={"submitit": "pip install 'qrlsuite[slurm]'"},
+            extras={"submitit": "pip install submitit"},
             submits=True,
             remote=True,
         )

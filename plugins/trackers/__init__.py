@@ -16,7 +16,7 @@ def register_trackers(register: Callable[[TrackerSpec], None]) -> None:
             name="tensorboard",
             summary="Scores, returns and losses of every seed in TensorBoard, beside the results or in a folder",
             factory="qrlsuite.plugins.trackers.tensorboard:TensorBoard",
-            extras={"tensorboard": "pip install 'qrlsuite[tensorboard]'"},
+            extras={"tensorboard": "pip install tensorboard"},
         )
     )
     register(
@@ -24,7 +24,7 @@ def register_trackers(register: Callable[[TrackerSpec], None]) -> None:
             name="wandb",
             summary="Every seed as a run of Weights & Biases, offline unless WANDB_MODE says online",
             factory="qrlsuite.plugins.trackers.wandb:WandB",
-            extras={"wandb": "pip install 'qrlsuite[wandb]'"},
+            extras={"wandb": "pip install wandb"},
         )
     )
     register(
@@ -32,6 +32,6 @@ def register_trackers(register: Callable[[TrackerSpec], None]) -> None:
             name="mlflow",
             summary="Every seed as a run of MLflow, in the results folder's mlflow.db, a folder or on a server",
             factory="qrlsuite.plugins.trackers.mlflow:MLflow",
-            extras=dict.fromkeys(("mlflow", "sqlalchemy"), "pip install 'qrlsuite[mlflow]'"),
+            extras=dict.fromkeys(("mlflow", "sqlalchemy"), "pip install mlflow"),
         )
     )

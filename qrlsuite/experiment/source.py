@@ -52,6 +52,8 @@ def _unfolded(node: ast.AST) -> Iterator[ast.AST | str]:
         if name in ("kind", "type_ignores", "type_comment"):
             continue
         value: Any = getattr(node, name, None)
+        if name == "is_lazy":
+            value = value or None  # Python 3.15 writes 0 at every import that is not
         if isinstance(node, _DOCUMENTED) and name == "body":
             value = _without_docstring(value)
         elif isinstance(node, ast.JoinedStr):

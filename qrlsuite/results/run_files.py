@@ -265,7 +265,7 @@ def _require_size(stream: io.BytesIO, length: int, source: str) -> None:
 def _tensorboard(paths: Sequence[Path], metric: str | None) -> tuple[str, Curve]:
     """Return a scalar of event files; the last written value of a step counts."""
     if importlib.util.find_spec("tensorboard") is None:
-        raise FileError(f"{paths[0]}: to read it, pip install 'qrlsuite[tensorboard]'")
+        raise FileError(f"{paths[0]}: to read it, pip install tensorboard")
     wanted = METRICS if metric is None else (metric,)
     found: dict[str, dict[int, float]] = {}
     for path in sorted(paths, key=lambda path: path.name):

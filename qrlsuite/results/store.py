@@ -112,7 +112,7 @@ def read_json(path: Path) -> dict[str, Any]:
     if version != FORMAT_VERSION:
         raise StoreError(
             f"{path} has format version {version!r}, this suite reads {FORMAT_VERSION}: "
-            "use the suite that wrote it (pip install -U qrlsuite), or another folder (--runs DIR)"
+            "use the version of the suite that wrote it, or another folder (--runs DIR)"
         )
     genuine.require_plain(path, content)
     return content

@@ -154,7 +154,7 @@ def test_a_missing_package_is_named_once(
             assert backend.gpu_simulator is None
         said = capsys.readouterr().err
         assert said.count("plain torch operations") == 1
-        assert "pip install 'qrlsuite[cuda]'" in said
+        assert "pip install 'numba-cuda[cu13]'" in said
     finally:
         native.trouble.cache_clear()
 

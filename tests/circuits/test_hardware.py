@@ -24,11 +24,9 @@ from qrlsuite.plugins.circuits.pennylane import braket_terms
 from qrlsuite.plugins.circuits.runtime import Runtime
 
 IBM = pytest.mark.skipif(
-    importlib.util.find_spec("qiskit_ibm_runtime") is None, reason="pip install 'qrlsuite[ibm]'"
+    importlib.util.find_spec("qiskit_ibm_runtime") is None, reason="pip install '.[ibm]'"
 )
-BRAKET = pytest.mark.skipif(
-    importlib.util.find_spec("braket") is None, reason="pip install 'qrlsuite[braket]'"
-)
+BRAKET = pytest.mark.skipif(importlib.util.find_spec("braket") is None, reason="pip install '.[braket]'")
 
 
 def deep() -> Circuit:
@@ -185,8 +183,8 @@ def test_without_their_packages_devices_name_them() -> None:
     with pytest.raises(OptionError, match=r"mitigation = .zero-noise.: device .default\.qubit. has no noise"):
         create_backend("pennylane", deep(), mitigation="zero-noise")
     if importlib.util.find_spec("qiskit_ibm_runtime") is None:
-        with pytest.raises(OptionError, match=r"pip install 'qrlsuite\[ibm\]'"):
+        with pytest.raises(OptionError, match=r"pip install qiskit-ibm-runtime"):
             create_backend("qiskit", deep(), device="ibm_fez", shots=9)
     if importlib.util.find_spec("braket") is None:
-        with pytest.raises(OptionError, match=r"pip install 'qrlsuite\[braket\]'"):
+        with pytest.raises(OptionError, match=r"pip install amazon-braket-pennylane-plugin"):
             create_backend("pennylane", deep(), device="arn:aws:braket:::device/qpu/ionq/Forte-1", shots=9)

@@ -170,12 +170,22 @@ def test_what_is_not_used_is_not_imported() -> None:
         new = {name.partition(".")[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names)
         assert new <= {"qrlsuite"}, new
         assert not imported("qrlsuite.registry", "importlib.metadata")
-        import qrlsuite.registry
+        import qrlsuite.cli, qrlsuite.registry
         assert not qrlsuite.registry.create(strict=True).problems
-        heavy = {"torch", "pennylane", "qiskit", "numba", "scipy", "gymnasium", "matplotlib"}
+        quantum = {"pennylane", "qiskit", "qiskit_aer", "qiskit_machine_learning"}
+        heavy = {"torch", "numba", "scipy", "gymnasium", "matplotlib", "sklearn"} | quantum
+        assert not imported(*heavy), imported(*heavy)
+        sys.argv = ["qrlsuite", "--help"]
+        try:
+            qrlsuite.cli.main()
+        except SystemExit as end:
+            assert not end.code
         assert not imported(*heavy), imported(*heavy)
         import qrlsuite.cli.commands.run, qrlsuite.cli.commands.study, qrlsuite.cli.commands.tune, qrlsuite.api
         assert not imported("torch")
+        from qrlsuite.circuit import ansatz, create_backend
+        create_backend("native", ansatz("iqp", 2, 1))
+        assert not imported(*quantum), imported(*quantum)
     """
     subprocess.run([sys.executable, "-c", program], check=True)
 

@@ -9,10 +9,12 @@ import inspect
 import itertools
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
 
 from qrlsuite import options, registry, specs
 from qrlsuite.experiment.entry import resolve
@@ -21,6 +23,7 @@ from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.notation import joined
 from qrlsuite.options import parse_setting
+from tests.core.test_dependencies import FOLDERS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -49,6 +52,18 @@ def commands() -> list[tuple[str, str]]:
         lines = (line.strip().removeprefix("$ ") for each in whole for line in each.splitlines())
         found += [(page.name, line) for line in lines if line.startswith("qrlsuite ")]
     return found
+
+
+def test_nothing_is_installed_by_a_name_that_is_free_for_anyone() -> None:
+    """The suite is on no index yet. What messages install instead are packages of its extras."""
+    code = [path for folder in FOLDERS.values() for path in [*folder.rglob("*.py"), *folder.rglob("*.toml")]]
+    for path in [*PAGES, *code, *(ROOT / "benchmarks").glob("*.py"), ROOT / "CHANGELOG.md"]:
+        assert not re.search(r"pip install[^`\n]*[ ']qrlsuite\b|qrlsuite\[[a-z]", path.read_text()), path
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    offered = {Requirement(each).name for extra in extras.values() for each in extra}
+    for kind in (specs.EngineSpec, specs.TrackerSpec):
+        for registered in registry.create().of(kind).values():
+            assert {each.removeprefix("pip install ") for each in registered.spec.extras.values()} <= offered
 
 
 OF_PLUGINS = {"rzz-cost"}

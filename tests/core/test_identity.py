@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import os
@@ -515,11 +516,30 @@ READ = (
 def test_every_python_reads_the_same_tree() -> None:
     """The walk needs the standard library only, so that interpreters without the suite can be asked."""
     assert hashlib.sha256(source.canonical(SAMPLE)).hexdigest() == GOLDEN
-    for python in filter(None, (shutil.which(f"python3.{minor}") for minor in (11, 12, 13, 14))):
+    for python in filter(None, (shutil.which(f"python3.{minor}") for minor in range(11, 16))):
         words = [python, "-I", "-c", READ, source.__file__]
         done = subprocess.run(words, input=SAMPLE, capture_output=True, check=False)
         if done.returncode != 127:  # a shim of a version that is not in use
             assert hashlib.sha256(done.stdout).hexdigest() == GOLDEN, done.stderr
+
+
+@pytest.mark.parametrize("lazy", [0, 1])
+def test_an_import_as_python_3_15_reads_it_is_the_same_unless_it_is_lazy(
+    lazy: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, parse = source.canonical(SAMPLE), ast.parse
+
+    def later(text: bytes) -> ast.Module:
+        tree = parse(text)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                vars(node).update(is_lazy=lazy, _fields=(*node._fields, "is_lazy"))
+        return tree
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ast, "parse", later)
+        read = source.canonical(SAMPLE)
+    assert (read == plain) == (not lazy)
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_the_versions_that_a_distribution_requires(
         registry.check_version(found, version)
     else:
         with pytest.raises(
-            PluginError, match=r"'acme' 2.5 requires qrlsuite.*, and this is qrlsuite 0\..*pip install"
+            PluginError, match=r"'acme' 2.5 requires qrlsuite.*, and this is qrlsuite 0\..*: upgrade acme"
         ):
             registry.check_version(found, version)
 

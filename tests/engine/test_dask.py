@@ -26,7 +26,7 @@ from tests.commands import Command, qrlsuite, start
 from tests.conftest import TINY, Train, most_epochs, results
 from tests.engine.stress import compare, undisturbed
 
-pytest.importorskip("distributed", reason="pip install 'qrlsuite[dask]'")
+pytest.importorskip("distributed", reason="pip install '.[dask]'")
 
 import dask
 import psutil

@@ -41,7 +41,7 @@ def test_engines_enter_by_the_door_of_plugins() -> None:
 
 def test_a_missing_package_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(QrlSuiteError, match=r"needs the package 'submitit': pip install 'qrlsuite\[slurm\]'"):
+    with pytest.raises(QrlSuiteError, match=r"needs the package 'submitit': pip install submitit"):
         where.build("slurm", {})
 
 
@@ -68,7 +68,7 @@ def test_times_that_are_none(text: str) -> None:
 
 
 def test_slurm_that_is_not_there(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
+    pytest.importorskip("submitit", reason="pip install '.[slurm]'")
     store = EntryStore(train("runs", [0], 1))
     monkeypatch.setenv("PATH", "")
     engine = SlurmEngine(SlurmOptions())
@@ -234,7 +234,7 @@ def test_status_tells_what_waits_from_what_has_left_the_queue(
     train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Task 9_1 was canceled before it began: only SLURM can know."""
-    pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
+    pytest.importorskip("submitit", reason="pip install '.[slurm]'")
     entry = train("runs", [0], 1)
     tasks = [{"job": "9_0", "seeds": [5, 6], "epochs": 3}, {"job": "9_1", "seeds": [7], "epochs": 3}]
     write_json(entry / "slurm" / "submitted.json", {"tasks": tasks})

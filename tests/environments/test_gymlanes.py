@@ -216,7 +216,7 @@ def test_environments_that_cannot_be_used(env_id: str, arguments: dict[str, Any]
 
 @pytest.mark.parametrize(
     ("env_id", "package", "command"),
-    [("LunarLander-v3", "Box2D", r"qrlsuite\[box2d\]"), ("Ant-v5", "mujoco", r"gymnasium\[mujoco\]")],
+    [("LunarLander-v3", "Box2D", r"gymnasium\[box2d\]"), ("Ant-v5", "mujoco", r"gymnasium\[mujoco\]")],
 )
 def test_a_missing_package_is_named_with_the_command_that_installs_it(
     env_id: str, package: str, command: str, monkeypatch: pytest.MonkeyPatch

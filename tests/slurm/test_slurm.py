@@ -37,7 +37,7 @@ def _slurm() -> str | None:
     try:
         import submitit  # noqa: F401
     except ImportError:
-        return "submitit is not installed (pip install 'qrlsuite[slurm]')"
+        return "submitit is not installed (pip install '.[slurm]')"
     return None
 
 

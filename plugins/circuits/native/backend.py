@@ -201,7 +201,7 @@ class NativeBackend:
 def trouble() -> str | None:
     """Return why kernels do not run on a GPU here, None where they do; said once, for torch operations are slower."""
     if importlib.util.find_spec("numba_cuda") is None:
-        problem = "pip install 'qrlsuite[cuda]'"
+        problem = "pip install 'numba-cuda[cu13]' 'numpy<2.5'"
     else:
         try:
             from qrlsuite.plugins.circuits.native import gpu
