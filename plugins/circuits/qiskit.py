@@ -130,17 +130,14 @@ class QiskitBackend:
         from qiskit_machine_learning.primitives import QMLEstimator
 
         primitive = QMLEstimator(default_precision=0.0)
-        if self.gradient == "lin-comb":
-            gradient = LinCombEstimatorGradient(primitive)
-        else:
-            gradient = ParamShiftEstimatorGradient(primitive)
+        kind = LinCombEstimatorGradient if self.gradient == "lin-comb" else ParamShiftEstimatorGradient
         return EstimatorQNN(
             circuit=self._circuit,
             estimator=primitive,
             observables=self.observables,
             input_params=list(self._circuit.parameters),
             weight_params=[],
-            gradient=gradient,
+            gradient=kind(primitive),
             input_gradients=True,
             default_precision=0.0,
         )
