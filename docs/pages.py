@@ -1,4 +1,7 @@
-"""A hook of mkdocs: pages of notebooks with their stored output, and the table of statements. Nothing is executed."""
+"""A hook of mkdocs: notebooks as pages with their stored output, results in the navigation, the table of statements.
+
+Nothing is executed.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+LISTED = "Every study and board"
+"""The section of the navigation with the pages of docs/results."""
+
 
 class Notebook(File):
     """A notebook that mkdocs takes for a page in Markdown, so that links to it and in it are checked and translated."""
@@ -20,6 +26,17 @@ class Notebook(File):
     def is_documentation_page(self) -> bool:
         """Return that it is a page."""
         return True
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Put the pages of results in the navigation, below the page that lists them."""
+    (results,) = (item["Results"] for item in config.nav or [] if "Results" in item)
+    (section,) = (item[LISTED] for item in results if LISTED in item)
+    pages = sorted(f"results/{page.name}" for page in Path(config.docs_dir, "results").glob("*.md"))
+    boards = [page for page in pages if page.startswith("results/board-")]
+    studies = [page for page in pages if page not in (*boards, *section)]
+    section += [{"Studies": studies}, {"Boards": boards}]
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

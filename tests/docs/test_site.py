@@ -71,6 +71,14 @@ def test_tutorials_are_pages_with_their_output(site: Path) -> None:
     assert 'href="tutorials/start.html"' in (site / "start.html").read_text(), "links lead to pages"
 
 
+def test_every_page_of_results_is_in_the_navigation(site: Path) -> None:
+    text = (site / "results" / "index.html").read_text()
+    listed = re.findall(r'<a href="([\w.-]+)" class="md-nav__link">', text)
+    pages = {page.name for page in (site / "results").glob("*.html")} - {"index.html"}
+    assert len(pages) > 30
+    assert sorted(listed) == sorted(pages)
+
+
 @pytest.mark.parametrize(
     ("page", "names"),
     [
