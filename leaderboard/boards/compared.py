@@ -153,8 +153,11 @@ SYMBOLS = {
 """Sign, color and meaning of each outcome of a cell; the sign alone is enough."""
 
 
-LONGEST_WORD = 14
-"""Letters that a column's head may have side by side; entries with longer words in their labels are A and B."""
+LONGEST_WORD = 10
+"""Letters that a column's head may have side by side; entries with longer words in their labels are A and B.
+
+So the table fits a terminal of 80 columns.
+"""
 
 
 def pair_table(pair: PairVerdict) -> Table:
@@ -174,7 +177,7 @@ def pair_table(pair: PairVerdict) -> Table:
     )
     for name in (heading, *heads, size, p):
         result.add_column(Text(name), justify="right", no_wrap=True)
-    result.add_column(Text(verdict), no_wrap=True)
+    result.add_column(Text(verdict))
     for row in pair.rows():
         result.add_row(*map(Text, row))
     return result

@@ -42,9 +42,9 @@ class RowView:
 
 
 def sentence(line: str, longest: int = 1000) -> str:
-    """Return a note or a head with a capital letter."""
-    text = clean(line, longest)
-    return text[:1].upper() + text[1:]
+    """Return a note or a head with a capital letter, unless it begins with an option, and without marks of code."""
+    text = clean(line, longest).replace("`", "")
+    return text if "=" in text.split(" ")[0] else text[:1].upper() + text[1:]
 
 
 def cell(column: Column[Any], row: Any) -> tuple[str, str]:

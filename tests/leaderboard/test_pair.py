@@ -212,14 +212,20 @@ def test_the_board_of_more_entries_is_stricter() -> None:
     assert pair.on_board(first, few, [first, few, *others], 0.05) is None
 
 
-def test_numbers_in_a_label_are_never_cut_by_a_narrow_terminal() -> None:
-    compared = compare_entries(entry("mlp width=16", spread(18)), entry("mlp width=64", spread(38)))
+@pytest.mark.parametrize(
+    ("labels", "reached_at"),
+    [(("mlp width=16", "mlp width=64"), (18, 38)), (("mine steps=6000", "mine steps=7000"), (100, 100))],
+)
+def test_numbers_are_never_cut_by_a_narrow_terminal(
+    labels: tuple[str, str], reached_at: tuple[int, int]
+) -> None:
+    compared = compare_entries(*(entry(*each) for each in zip(labels, map(spread, reached_at))))
     console = Console(width=80, file=io.StringIO())
     console.print(pair_table(compared.pair))
     shown = console.file.getvalue()
-    assert "width=16   width=64" in shown
+    assert "   ".join(label.split()[1] for label in labels) in shown
     for cells in compared.pair.rows():
-        assert all(cell in shown for cell in cells), cells
+        assert all(cell in shown for cell in (*cells[:-1], *cells[-1].split())), cells
 
 
 def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:

@@ -20,6 +20,7 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.report import encode, entries, ladder, render, sections, winners
 from qrlsuite.leaderboard.report.judge import judge
+from qrlsuite.leaderboard.report.rows import sentence
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.options import parse_setting
 from qrlsuite.results.records import ImportedRecord
@@ -268,3 +269,8 @@ def test_a_board_is_cited_by_what_it_ranks() -> None:
     (saved,) = re.findall(r'download="beam6g.svg" href="data:image/svg\+xml,([^"]+)"', page)
     texts = [element.text for element in ElementTree.fromstring(unquote(saved)).iter()]
     assert "<b>fast</b>: rank 1 of 2 entries" in texts
+
+
+def test_notes_begin_with_a_capital_but_for_options_and_have_no_marks_of_code() -> None:
+    assert sentence("rank: `qrlsuite compare` decides") == "Rank: qrlsuite compare decides"
+    assert sentence("target_steps=2000 copies nothing") == "target_steps=2000 copies nothing"
