@@ -368,7 +368,10 @@ def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str, metric
         raise FileError(
             f"{source}, {place}: {texts}: seed and step are whole numbers, and the score is a number"
         ) from None
-    rows.add(str(entry).strip(), *numbers, source, metric)
+    name = re.sub(
+        rf"__{numbers[0]}__\d{{9,}}$", "", str(entry).strip()
+    )  # CleanRL's run: its seed, and when it began
+    rows.add(name, *numbers, source, metric)
 
 
 _SEED = re.compile(

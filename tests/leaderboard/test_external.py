@@ -292,6 +292,7 @@ def test_thresholds_and_scores_are_rounded_alike(tmp_path: Path) -> None:
 COLUMNS = {
     "Model,run,global_step,charts/episodic_return": "a,1,10,3",
     "run,seed,global_step,charts/episodic_return": "a,1,10,3",
+    "run,seed,timesteps,charts/episodic_return": "x__a__1__1700000000,1,10,3",
     "group,run_name,seed,Step,validation/score,loss": "a,a_1,1,10,3,7",
     "exp_name,run_name,seed,episode,score": "a,x__a__1__1700000000,1,10,3",
     "Step,a_1 - rollout/ep_rew_mean,a_1 - rollout/ep_rew_mean__MIN,a_2 - rollout/ep_rew_mean": "10,3,0,",
