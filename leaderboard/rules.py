@@ -42,14 +42,15 @@ def register_rules(register: Callable[[RuleSpec], None]) -> None:
     register(
         RuleSpec(
             name=STEPS,
-            summary="labels of runs permuted, ratio of mean steps below all tolerances: the rule of boards and compare",
+            summary="labels of runs permuted, ratio of mean steps below all thresholds: the rule of boards "
+            "and compare",
             factory=f"{_PERMUTATION}:StepsRule",
         )
     )
     register(
         RuleSpec(
             name="times",
-            summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
+            summary="labels of runs permuted, mean steps below each threshold; 5 percent over all thresholds",
             factory=f"{_PERMUTATION}:TimesRule",
         )
     )

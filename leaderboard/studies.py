@@ -138,7 +138,7 @@ def select(
     selected, left_out = collect.select(dataclasses.replace(selection, only=keys), horizon=horizon)
     if not selected:
         searched = f"{runs} and the published entries hold" if published_too else f"{runs} holds"
-        more = "" if published_too else "; --published shows those that come with the suite"
+        more = "" if published_too else "; --published shows the entries that come with the suite"
         raise UnknownNameError(f"{searched} no entry of study '{name}' yet: qrlsuite study run {name}{more}")
     return selected, left_out
 
@@ -182,7 +182,7 @@ def draw(
     names:
         A study, or for `pairs` several with looks, each of another task.
     selection, horizon, seeds, settings:
-        As for `qrlsuite.leaderboard.pictures.compose.compose`. Agents that play are those of the results folder.
+        As for `qrlsuite.leaderboard.pictures.compose.compose`. The results folder's agents play.
     """
     name, *more = names
     study = find(name)
@@ -209,9 +209,7 @@ def draw(
         raise OptionError(f"study '{name}' has no entry{selection.of_tasks}")
     data = pictures.KINDS[section.kind].data
     if data == "deployed" and section.evaluation is None:
-        raise OptionError(
-            f"picture '{kind}' is drawn where a study's file says what is evaluated, as `deploy` does"
-        )
+        raise OptionError(f"picture '{kind}' needs a study whose file has an evaluation, such as `deploy`")
     if data == "deployed" and (seeds is not None or horizon is not None):
         raise OptionError(
             f"picture '{kind}' plays the best agents of all seeds: leave --seeds and --horizon out"
@@ -289,8 +287,8 @@ def _deployed(picture: PictureSection, entries: Sequence[EntryResults], own: Map
                 deployment = Deployment(store, where.backend, where.chosen(value), best)
                 if not deployment.simulator:
                     raise OptionError(
-                        f"{deployment.name} is no simulator: a picture executes nothing on hardware; use `qrlsuite "
-                        "evaluate` with --yes"
+                        f"{deployment.name} is not a simulator: a picture executes nothing on hardware; use "
+                        "`qrlsuite evaluate` with --yes"
                     )
                 elsewhere.append(deployment.play(episodes, 0))
         lines.append(drawing.Line(trained, tuple(elsewhere)))

@@ -31,7 +31,7 @@ class Column(Generic[Row]):
     cell:
         Writes a row into a cell, where that shows more than the value: an interval, or a mark.
     flat:
-        Its heads in a spreadsheet, one for each part of the value; by default those of an interval end in `_low` and
+        Its heads in a spreadsheet, one for each part of the value; by default an interval's names end in `_low` and
         `_high`. Empty where spreadsheets leave it out.
     words:
         Whether cells are words, which stand at the left and may be broken into lines; numbers stand at the right.

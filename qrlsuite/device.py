@@ -114,7 +114,7 @@ class DeviceLanes:
 
 
 class EpisodesOnDevice(DeviceLanes):
-    """Plays lanes whose episodes end by what is done: a base for environments.
+    """Plays lanes whose episodes end by the agent's actions: a base for environments.
 
     The state is the lanes' `state_dict`, with `step` and `ended`. A lane may begin an episode after every step, so as
     many beginnings are drawn by lanes of the same kind, one for each, from copies of the streams.
@@ -166,7 +166,7 @@ class EpisodesOnDevice(DeviceLanes):
 
 
 def upload(state: dict[str, Tensor], device: torch.device, /, **values: Any) -> None:
-    """Copy arrays or tensors into those of `state`, on a device; other memory is taken only where shapes change."""
+    """Copy arrays or tensors into the ones of `state`, on a device; other memory is taken only where shapes change."""
     for name, value in values.items():
         new = torch.as_tensor(value)
         if name in state and state[name].shape == new.shape:
@@ -231,7 +231,8 @@ class Captured:
             except Exception as error:  # a plain round raises it again, if it is the round's own
                 graph, self._refused = None, True
                 print(
-                    f"qrlsuite: rounds cannot be captured as a CUDA graph, and run as without it: {error}",
+                    "qrlsuite: rounds cannot be captured as a CUDA graph, so they run one operation at a "
+                    f"time: {error}",
                     file=sys.stderr,
                     flush=True,
                 )

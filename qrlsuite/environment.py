@@ -259,12 +259,12 @@ class EpisodeLanes(LaneEnv):
         return {name: value.copy() for name, value in self._state().items()}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes.
+        """Continue where `state_dict` was taken; states may be sliced and concatenated along the lanes.
 
         Raises
         ------
         qrlsuite.errors.StoreError
-            If an array is missing, has another shape, or holds what cannot be; nothing is changed then.
+            If an array is missing, has another shape, or holds an impossible value; nothing is changed then.
         """
         known = self._state()
         require_state(self.name, state, {name: value.shape for name, value in known.items()})

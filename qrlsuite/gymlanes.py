@@ -208,8 +208,8 @@ class GymLanes(LaneEnv):
                 ) from error
             if not np.array_equal(self._raw[lane], state["observation"][lane], equal_nan=True):
                 raise StoreError(
-                    f"environment '{self.env_id}' cannot be resumed: with the same reset seed and the same actions "
-                    "it does something else, so its randomness does not all come from reset(seed=...)"
+                    f"environment '{self.env_id}' cannot be resumed: the same reset seed and actions give "
+                    "other results, so some of its randomness does not come from reset(seed=...)"
                 )
         self._begun = True
 
@@ -418,7 +418,7 @@ def _supported(
 
 
 def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
-    """Return the content of a task file for a quick look at a Gymnasium environment, `--task gym:ID`.
+    """Return a task file's content for a quick look at a Gymnasium environment, `--task gym:ID`.
 
     20 seeds, 100 epochs of 1000 steps in 10 environments, 20 validation episodes. Thresholds on the return are
     derived from the `reward_threshold` T at which Gymnasium counts the environment as solved: T - |T|,
@@ -453,19 +453,21 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     lowest, highest = random_returns(env_id, options.get("max_episode_steps"))
     thresholds = [level for level in derived if level > lowest]
     what = f"{env_id} of Gymnasium" if name is None else f"environment '{name}'"
-    summary = f"{what}, with settings for a quick look"
-    if len(thresholds) < len(derived):
-        reached = ", ".join(f"{level:g}" for level in derived if level <= lowest)
-        summary += f"; without threshold {reached}, which random actions always reach"
+    summary = f"{what}, for a quick look"
     if not thresholds:
         if highest == lowest:
             raise OptionError(
                 f"{name or f'gym:{env_id}'}: random actions always have the return {lowest:g}, which reaches every "
-                "threshold that is known (0, or what Gymnasium calls solved): write a task file that "
-                "says what a good return is"
+                "known threshold (0, or Gymnasium's own): write a task file with thresholds on the return"
             )
         thresholds = [highest]
-        summary += "; instead of it, the highest return of 10 random episodes"
+        summary += (
+            f"; no known scores, so the only threshold is the best of 10 random episodes ({highest:g}): for a real "
+            "comparison, write a task file"
+        )
+    elif len(thresholds) < len(derived):
+        reached = ", ".join(f"{level:g}" for level in derived if level <= lowest)
+        summary += f"; without threshold {reached}, because random actions always reach it"
     return {
         "format_version": 1,
         "name": name or quick_name(env_id),

@@ -1,7 +1,7 @@
 """Masks of allowed actions, if an environment has them (`infos["action_mask"]`, see `qrlsuite.environment`).
 
 An algorithm keeps the mask of an observation behind it, in one tensor (S, B, obs + choices): so it is stored, drawn
-from a buffer and saved with the observation. Without masks there is nothing behind, and nothing is computed.
+from a buffer and saved with the observation. Without masks nothing is appended or computed.
 """
 
 from __future__ import annotations

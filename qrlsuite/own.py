@@ -49,7 +49,7 @@ from qrlsuite.files import read_bytes
 from qrlsuite.registry import Plugin, Registered, Registry
 
 MOST_BYTES, MOST_FILES = 16 << 20, 500
-"""What a plugin may hold at most."""
+"""The limits of a plugin's size."""
 _MOST_WORDS = 300
 """Shown characters of an error's message."""
 
@@ -158,7 +158,8 @@ def _cache() -> Path:
 
 
 def copy(source: Source, folder: Path) -> Path:
-    """Have a plugin's content in a subfolder that is named by it, whatever is there; return the plugin's path there.
+    """Write a plugin's content to a subfolder that is named by it, over any earlier content; return the plugin's path
+    there.
 
     Raises
     ------
@@ -202,7 +203,7 @@ def read(path: str | os.PathLike[str]) -> Source:
     Raises
     ------
     PluginError
-        If there is none, or it cannot be a module or package; the message says what to type.
+        If there is none, or it cannot be a module or package; the message names a usable name.
     """
     shown, place = os.fspath(path), Path(os.path.abspath(path))
     if place.is_dir():
@@ -221,7 +222,7 @@ def read(path: str | os.PathLike[str]) -> Source:
         )
     source = Source(place, files)
     if _is_copy(str(place)) and source.mark != place.parent.name:
-        raise PluginError(f"plugin {shown} is a copy, and not what it was: give the plugin itself")
+        raise PluginError(f"plugin {shown} is a copy that was changed: give the plugin itself")
     return source
 
 
@@ -404,8 +405,8 @@ def load_named(paths: Any, folder: Path | None, source: str) -> None:
             load(os.path.relpath(folder / path) if folder is not None else path)
         elif of_distribution(_package_of(folder, path)) is None:
             raise FileError(
-                f"{source}: plugins: what lies beside results is not imported on the word of a file there; if you "
-                f"trust it, add --plugin {os.path.join(folder or '', path)}"
+                f"{source}: plugins: no file in a results folder may load code from there; if you trust it, "
+                f"add --plugin {os.path.join(folder or '', path)}"
             )
 
 
@@ -471,7 +472,7 @@ def _load(known: Registry, source: Source) -> Loaded:
 
 
 class _Reader(SourceFileLoader):
-    """Imports what was read, not what may lie in its place, nor bytecode beside it."""
+    """Imports the text that was read, not a later file in its place, nor bytecode beside it."""
 
     def path_stats(self, path: Any) -> Any:
         raise OSError("bytecode is not used")
@@ -588,7 +589,7 @@ def _sources() -> list[Source]:
 
 
 def _shown(text: str) -> str:
-    """Return a text with the user's paths in place of those of copies."""
+    """Return a text with the user's paths in place of the copies' paths."""
     for source in _sources():
         text = text.replace(f"{source.copy.parent}{os.sep}", f"{source.path.parent}{os.sep}")
     return text
@@ -662,7 +663,7 @@ def blamed() -> Iterator[None]:
             raise
         if isinstance(error, OptionError):
             raise PluginError(str(placed(error))) from error
-        raise PluginError(f"{failure(error)}: mend it, and repeat the command") from error
+        raise PluginError(f"{failure(error)}: fix it and rerun the command") from error
 
 
 def _failure(source: Source, error: BaseException) -> str:
@@ -677,7 +678,7 @@ def _failure(source: Source, error: BaseException) -> str:
 
 
 def _forget(source: Source) -> None:
-    """Have a plugin's modules be imported no more."""
+    """Remove a plugin's modules from the imported ones."""
     for name in [name for name in sys.modules if name.partition(".")[0] in source.modules]:
         del sys.modules[name]
     if str(source.copy.parent) in sys.path:
@@ -701,7 +702,7 @@ Thing = TypeVar("Thing")
 
 
 def note(thing: Thing) -> Thing:
-    """Be `qrlsuite.register` in a plugin's file that is being imported."""
+    """Stand for `qrlsuite.register` in a plugin's file that is being imported."""
     caller = sys._getframe(1)
     register(thing, f"{caller.f_code.co_filename}:{caller.f_lineno}")
     return thing

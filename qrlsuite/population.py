@@ -37,8 +37,8 @@ DecaySteps = Annotated[
     int | None,
     Field(
         ge=1,
-        description="interactions of a seed after which learning rates have fallen to 0, linearly, epoch by epoch; "
-        "absent: they stay",
+        description="interactions of a seed after which learning rates have fallen to 0, linearly, epoch "
+        "by epoch; absent: they are constant",
     ),
     Since("0.2.0"),
 ]
@@ -473,7 +473,7 @@ def loop(modules: Sequence[nn.Module], options: Any = None) -> nn.Module:
     """Turn S modules of one architecture into a population that runs them one by one.
 
     For modules that cannot be run by `torch.vmap`, code of another framework say: `population` of a model's spec is
-    then `"qrlsuite.population:loop"`, and nothing is tried or said at the first pass. It takes S times as long.
+    then `"qrlsuite.population:loop"`, and the first pass tries nothing else. It takes S times as long.
 
     Raises
     ------
@@ -518,7 +518,7 @@ class Adam:
     """Adam for a population: elementwise, with a step count per agent and two learning rates.
 
     Equal to `torch.optim.Adam` (Kingma & Ba 2015, no weight decay) for every agent that takes part in every
-    step. An agent that is masked out of a step keeps its parameters, moments and step count, as if the step
+    step. An agent that is left out of a step keeps its parameters, moments and step count, as if the step
     had not been. Plain elementwise operations only: fused optimizers round differently at the end of a
     tensor, so that an agent would depend on its place in the stack. For a population with an attribute `compiled =
     True` the step is a compiled loop, which rounds differently; on the CPU and in float32.
@@ -572,7 +572,7 @@ class Adam:
         self._on_device: dict[str, Tensor] = {}
 
     def decay(self, interactions: int, decay_steps: int | None) -> None:
-        """Set the learning rates to what is left of the first ones after so many of `decay_steps` interactions."""
+        """Lower the learning rates linearly: `interactions` of `decay_steps` interactions are over."""
         if decay_steps is not None:
             left = max(0.0, 1.0 - interactions / decay_steps)
             self.rates = {name: rate * left for name, rate in self._first_rates.items()}

@@ -1,11 +1,11 @@
 """Finds plugins, and looks up their registered things.
 
-`load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that does not
-fit this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is
-reported by the name of its distribution and skipped as a whole; everything else works. A name registered twice is
-an error that names both places when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the
-first of these problems ends the command. `QRLSUITE_LOAD_PLUGINS=acme-qrl,other` loads the plugins of these
-distributions only, and an empty value the suite's plugins only.
+`load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that does not fit
+this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is reported
+by the name of its distribution and skipped as a whole; everything else goes on working. A name registered twice is an
+error that names both places when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the first of these
+problems ends the command. `QRLSUITE_LOAD_PLUGINS=acme-qrl,other` loads the plugins of these distributions only, and an
+empty value the suite's plugins only.
 """
 
 from __future__ import annotations

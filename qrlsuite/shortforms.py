@@ -12,9 +12,9 @@ dataclass, may replace further parameters, as in a package. The name is the func
 hyphens, the summary the first line of its docstring.
 
 A model's class attribute `family = "quantum"` says that it is one; otherwise it is one where its `__init__` or module
-says `qrlsuite.layer`. Class attributes `shared` of a model and `repeats` of an environment are those of the spec. An
-environment's `lanes` is a `qrlsuite.environment.LaneEnv`, called with its options and the number of lanes. Without it,
-episodes end after 1000 steps.
+says `qrlsuite.layer`. Class attributes `shared` of a model and `repeats` of an environment mean the same as in the
+spec. An environment's `lanes` is a `qrlsuite.environment.LaneEnv`, called with its options and the number of lanes.
+Without it, episodes end after 1000 steps.
 """
 
 from __future__ import annotations

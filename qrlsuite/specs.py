@@ -103,8 +103,8 @@ class PictureSpec(Spec):
     Attributes
     ----------
     draw:
-        Reference to `draw(worlds, options) -> matplotlib.figure.Figure`: `worlds` maps the name of each task
-        that was asked for to the options of its environment.
+        Reference to `draw(worlds, options) -> matplotlib.figure.Figure`: `worlds` maps the name of each chosen task to
+        the options of its environment.
     options:
         Reference to a pydantic dataclass: the picture's own settings, all with defaults.
     """
@@ -135,7 +135,7 @@ class EnvironmentSpec(NumericSpec):
     policies:
         Reference policies for `qrlsuite evaluate`, by name: each a reference to `factory(envs) -> policy`,
         called when all lanes of the `LaneEnv` have been reset, and `policy(observations) -> actions` maps
-        observations (num_envs, ...) to actions (num_envs, ...). It may look into `envs`, and so know more than
+        observations (num_envs, ...) to actions (num_envs, ...). It may read `envs`, and so know more than
         agents do. Uniformly random actions need no policy.
     pictures:
         Pictures of it for `qrlsuite plot`.
@@ -143,7 +143,7 @@ class EnvironmentSpec(NumericSpec):
         Options that change agents' observations alone, neither events nor rewards: a study with looks compares entries
         of tasks that differ in these options only.
     repeats:
-        Whether all seeds are meant to meet the same episodes: one, or a fixed cycle of levels. Boards say so.
+        Whether all seeds meet the same episodes on purpose: one, or a fixed cycle of levels. Boards say so.
     """
 
     kind, kinds = "environment", "environments"
@@ -168,8 +168,8 @@ class ModelSpec(NumericSpec):
     family:
         `"classical"` or `"quantum"`; selects family-dependent presets of a task.
     options:
-        Reference to a pydantic dataclass. If it has a method `check()`, that is called on options that were
-        typed, and may refuse them (`OptionError`) before anything is trained.
+        Reference to a pydantic dataclass. If it has a method `check()`, it is called on options that a user typed, and
+        may refuse them (`OptionError`) before anything is trained.
     build:
         Reference to `build(obs_dim, out_dim, options, generator) -> torch.nn.Module`, an ordinary
         single-agent module (B, obs_dim) -> (B, out_dim), every random number drawn from `generator`
@@ -190,7 +190,7 @@ class ModelSpec(NumericSpec):
     numerics_on:
         `numerics` by backend, where the bits of its model on one changed alone.
     shared:
-        Names of parameters with which all seeds are meant to begin alike, such as fixed features. Boards say so.
+        Names of parameters that are equal in all seeds at first, such as fixed features. Boards say so.
     """
 
     kind, kinds = "model", "models"
@@ -248,10 +248,10 @@ class AlgorithmSpec(NumericSpec):
     actions:
         The kinds of actions that it takes: some of `qrlsuite.actions.KINDS`.
     starting_values:
-        Values of options that a task's preset leaves out, and those of the quick look `--task gym:ID`.
+        Values of options that a task's preset leaves out, and of the quick look `--task gym:ID`.
     unusable:
-        Reference to `unusable(options, epochs, rounds, environments) -> list[str]`: sentences on options that are of no
-        use in a run of so many epochs. An epoch has `rounds` steps of each of a seed's `environments`. `options` are
+        Reference to `unusable(options, epochs, rounds, environments) -> list[str]`: sentences about options that are of
+        no use in a run of so many epochs. An epoch has `rounds` steps of each of a seed's `environments`. `options` are
         the values by name, and as `episode` the most steps of an episode, None where unknown. Boards call it, so its
         module imports no torch. None says nothing.
     """
@@ -417,7 +417,7 @@ class EngineSpec(Spec):
 
 @dataclass(frozen=True, slots=True)
 class TrackerSpec(Spec):
-    """A tracker that watches a run when it is asked for: `qrlsuite run --track NAME`, or `--track NAME=TARGET`.
+    """A tracker that watches a run on request: `qrlsuite run --track NAME`, or `--track NAME=TARGET`.
 
     Attributes
     ----------
@@ -427,7 +427,7 @@ class TrackerSpec(Spec):
     extras:
         Packages that it needs: the pip command by the name of the module.
     always:
-        Whether it watches every run, without being asked for.
+        Whether it watches every run, without a request.
     """
 
     kind, kinds = "tracker", "trackers"

@@ -79,9 +79,9 @@ class AcrossSection:
             f"{task} ({steps_text(horizon)} steps)"
             for task, horizon in zip(self.shares.tasks, self.shares.horizons)
         )
-        what = f"time {self.shares.before} threshold as a share of the horizon"
+        what = f"steps {self.shares.before} threshold as a share of the horizon"
         if self.by != "steps":
-            what = f"{self.by} {self.shares.before} threshold as a share of what the cheapest entry spent"
+            what = f"{self.by} {self.shares.before} threshold as a share of the cheapest entry's total"
         return f"across {', '.join(parts)}: {what}"
 
     @property
@@ -134,7 +134,8 @@ class AcrossSection:
         return [
             "mean: mean over tasks of the mean over seeds, less is better; IQM: mean of the middle half of all runs; "
             "intervals: bootstrap of runs within tasks, of each entry by itself",
-            "P: probability that a run needs less than one of the next entry, mean over tasks, ties one half",
+            "P: probability that a run needs less than a run of the next entry, mean over tasks, ties one "
+            "half",
             "needs less, needs more: runs permuted within tasks, Holm over all pairs: error probability "
             f"{self.alpha:g} for all together",
         ]

@@ -1,4 +1,4 @@
-"""The columns of boards by environment steps: of their ranks, of their tiers, and what is known of an entry.
+"""The columns of boards by environment steps: of ranks, of tiers, and facts about an entry.
 
 A new column is one more `Column` here: tables, the page, csv and JSON are made of these lists, and Arrow tables of
 `of_entry`.
@@ -192,9 +192,10 @@ def ranks(section: Section) -> list[Column[Row]]:
     return [
         ranks_column(
             lambda row: None if row.time.ranks is None else list(row.time.ranks),
-            meaning="1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
-            "A outperforms B if it needs significantly fewer steps at a threshold, and significantly more at none "
-            "(permutation tests, Holm's correction over all pairs of the board, filtered out or not)",
+            meaning="1 + the number of entries that outperform this one, to the last that the decided "
+            "pairs leave. A outperforms B if it needs significantly fewer steps, as a mean over "
+            "the thresholds (permutation tests, Holm's correction over all pairs of the board, "
+            "shown or not)",
             hover=lambda row: unranked_since(row.entry) if row.time.ranks is None else "",
         ),
         _name(section),
@@ -333,7 +334,8 @@ def facts(section: Section) -> list[Column[Row]]:
         Column(
             "",
             lambda row: sum(row.entry.parameters),
-            meaning="trained numbers of an agent; q: of a quantum circuit; fixed: those that stay as they were drawn",
+            meaning="trained numbers of an agent; q: of a quantum circuit; fixed: numbers that stay as "
+            "they were drawn",
             head="parameters",
             cell=lambda row: row.entry.parameters_text(" q"),
         ),

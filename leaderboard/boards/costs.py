@@ -66,8 +66,8 @@ UNITS = {
             "core-hours",
             hours_text,
             lambda hours: f"{3.6e6 * hours:.2g} ms",
-            "core-hours: processor time of training and validation, per step in milliseconds; seeds that train in "
-            "larger groups take less, and so they do on idle cores",
+            "core-hours: processor time of training and validation, per step in milliseconds; seeds take "
+            "less in larger groups and on idle cores",
         ),
     )
 }
@@ -302,8 +302,8 @@ class CostSection:
         lines = tables.doubts([row.entry for row in self.rows])
         if self.compared is not None:
             lines.append(
-                f"rank: by significant outperformance, within {self.unit.text(self.budget)} {self.unit.name}, which is "
-                f"what the cheapest spent in all; error {self.alpha:g} for all pairs together"
+                f"rank: by significant outperformance, within {self.unit.text(self.budget)} "
+                f"{self.unit.name}, the cheapest entry's total; error {self.alpha:g} for all pairs together"
             )
         by_problem: dict[str, list[str]] = {}
         for row in self.rows:
@@ -312,15 +312,15 @@ class CostSection:
         lines += [f"not ranked: {', '.join(labels)}: {problem}" for problem, labels in by_problem.items()]
         lines += [
             self.unit.meaning,
-            "per step: what the entry's seeds took in all, divided by all their environment steps; the others: of one "
-            "run; sample complexity: over all its epochs",
+            "per step: the total of the entry's seeds, divided by all their environment steps; other "
+            "columns: of one run; sample complexity: over all its epochs",
             f"{self.before} threshold: mean over seeds and thresholds; a run that does not get there counts with all "
             "of the budget (at cap)",
         ]
         if self.compared is not None and not self.exact:
             lines.append(f"curves are read at {CELLS} equal parts of the budget")
         if any(self.marked(row) for row in self.rows):
-            lines.append("~ : not to be compared with the others")
+            lines.append("~ : not comparable with the others")
         shots = {row.shots for row in self.rows if row.index is not None}
         if self.unit.name == "executions" and len(shots) > 1:
             lines.append("executions of different shots count alike here; --by shots counts shots")

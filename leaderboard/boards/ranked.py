@@ -53,8 +53,8 @@ def unranked_since(entry: EntryResults) -> str:
 
 
 WITH_LOOKS = (
-    "trained by a study with looks, which stops by what the seeds show, so that no rule for a fixed number of seeds "
-    "applies; `qrlsuite show STUDY` has its verdicts"
+    "trained by a study with looks, whose number of seeds depends on their results, so no rule for a fixed "
+    "number applies; `qrlsuite show STUDY` has its verdicts"
 )
 
 

@@ -92,7 +92,7 @@ class ScoreSection:
             case "area":
                 return f"area: mean {self.of} over all epochs"
             case "spread":
-                return "spread: how far a seed's steps are from those of the median seed, mean over seeds"
+                return "spread: how far a seed's steps are from the median seed's, mean over seeds"
         return f"final {self.of}: mean over the last tenth of the epochs ({self.n_last})"
 
     @property
@@ -156,8 +156,8 @@ class ScoreSection:
             f"rank: what the significant pairs leave ({int((better == 1).sum())} of {size * (size - 1) // 2}: "
             f"permutation test, Holm, error {self.alpha:g} for all pairs together)",
             "IQM: mean of the middle half of the seeds; intervals: bootstrap of the seeds, of each entry by itself",
-            f"P: probability that a seed {'scores more' if self.sign > 0 else 'has less'} than one of the next entry, "
-            "ties one half",
+            f"P: probability that a seed {'scores more' if self.sign > 0 else 'has less'} than a seed of "
+            "the next entry, ties one half",
         ]
         few = [entry.label for entry in self.unranked if len(entry.seeds) < MIN_RUNS]
         return [

@@ -200,7 +200,7 @@ def remarks(entries: Sequence[EntryResults]) -> list[str]:
         "parameters of the first network alone (older records count no other, such as a critic)": {
             entry.label: "" for entry in entries if entry.first_network_alone
         },
-        "made with code of others, and not probed": {entry.label: "" for entry in entries if entry.unprobed},
+        "made with a plugin's code, and not probed": {entry.label: "" for entry in entries if entry.unprobed},
         "not installed here, so judged from the stored curves": {
             name: "" for entry in entries for name in absent(entry)
         },
@@ -229,7 +229,7 @@ def doubts(entries: Sequence[EntryResults], horizon: int | None = None) -> list[
     nowhere = sum(len(entry.seeds) == failed[entry.label] for entry in entries) > 1
     by_area = "; `--by area` ranks by the learning curves alone" * nowhere
     notes = {
-        "curves that other programs made, and nobody here can train or check again": {
+        "curves of other programs, which nobody here can train or check again": {
             entry.label: entry.ended_early
             for entry in entries
             if entry.external and entry.algorithm != SCRIPT
@@ -292,7 +292,7 @@ def missing(entries: Sequence[EntryResults]) -> list[str]:
 
 
 def _listed(notes: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Write a line for each note: the labels that it is on, and what is said of each."""
+    """Write a line for each note: the entries' labels, each with its text."""
     return [
         f"{note}: {', '.join(f'{label} ({text})' if text else label for label, text in labels.items())}"
         for note, labels in notes.items()
@@ -340,7 +340,7 @@ def _settings(entries: Sequence[EntryResults]) -> list[str]:
     lines = [f"settings: {'; '.join(texts)}"] if texts else []
     tuned = [entry.tuning for entry in entries if entry.tuning]
     if 0 < len(tuned) < len(entries):
-        lines.append("tuned and untuned settings are compared: a difference may be one of tuning")
+        lines.append("tuned and untuned settings are compared: a difference may come from tuning")
     budgets = {record.get("budget") for record in tuned}
     if len(budgets) > 1:
         texts = sorted("not known" if budget is None else str(budget) for budget in budgets)

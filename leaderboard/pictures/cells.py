@@ -112,7 +112,7 @@ def choose_horizon(entries: Sequence[EntryResults], requested: int | None = None
 
 
 def level_name(entry: EntryResults) -> str:
-    """Return the title of the rows of a grid of an entry's task."""
+    """Return the row title for the grid of an entry's task."""
     name = entry.task_file.ranking.level_name
     return "ε" if name == "epsilon" else style.plain(name)
 

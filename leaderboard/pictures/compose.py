@@ -101,8 +101,8 @@ def compose(
     held = sorted({entry.task for entry in selected})
     if not selected:
         raise UnknownNameError(
-            f"{selection.runs} holds no results{selection.of_tasks} yet: qrlsuite run; --published draws those that "
-            "come with the suite"
+            f"{selection.runs} holds no results{selection.of_tasks} yet: qrlsuite run; --published draws "
+            "the entries that come with the suite"
         )
     if len(held) > 1 and not selection.tasks and not entries:
         raise OptionError(

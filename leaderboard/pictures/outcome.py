@@ -265,7 +265,7 @@ def _within(ratio: float) -> float:
 def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
     """Draw a pair and return the ends of its line, as ratios."""
     if not pair.p or math.isnan(pair.difference):
-        text = "both mean times are 0" if pair.p else "no look yet"
+        text = "both entries spend no step below a threshold" if pair.p else "no look yet"
         axes.annotate(text, (1, height), fontsize=8, va="center")
         return []
     ratio, low, high = (_within(1 + end) for end in pair.shown)

@@ -194,7 +194,7 @@ def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
 
 
 def _decision_cell(times: TimeRanking, i: int, j: int) -> tuple[str, str]:
-    """Return the text and the style of a cell of the matrix of adjusted p."""
+    """Return a cell's text and style in the matrix of adjusted p."""
     board, direction = times.board, times.board.directions[i][j]
     if i == j or direction is Direction.UNDECIDED:
         return ("", "self") if i == j else ("?", "tie")
@@ -203,7 +203,7 @@ def _decision_cell(times: TimeRanking, i: int, j: int) -> tuple[str, str]:
 
 
 def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str]:
-    """Return the text and the style of a cell of the matrix of pairs."""
+    """Return a cell's text and style in the matrix of pairs."""
     if row == column:
         return "", "self"
     pair = judgement.pair(row, column)

@@ -78,7 +78,7 @@ def _problem(root: Path, name: str) -> str | None:
     parts = name[len(place) + 1 :].split("/")
     strange = next((part for part in parts if not _NAME.fullmatch(part)), None)
     if strange:
-        return f"{strange!r} is no published name: those are of a-z, 0-9, '+', '.', '_' and '-'"
+        return f"{strange!r} is no valid name: use a-z, 0-9, '+', '.', '_' and '-'"
     if any((root / part).is_symlink() for part in [name, *map(str, Path(name).parents)]):
         return "it is a link, or behind one"
     of_study = place == PLACES[2]

@@ -310,7 +310,7 @@ def _size(entry: EntryResults) -> str:
 
 
 def read_copies(selection: Selection, name: str) -> list[EntryResults]:
-    """Read the copies of the entry that has a name, see `find`: of several codes, those of the first of `by_code`."""
+    """Read the copies of the entry that has a name, see `find`; of several codes, the first of `by_code` counts."""
     return by_code(_every_copy(selection, name))[0]
 
 
@@ -365,8 +365,8 @@ def _stores(selection: Selection, of_studies: bool = False) -> list[EntryStore]:
     runs = selection.runs
     if not runs.is_dir() and not selection.published:
         raise StoreError(
-            f"there is no results folder {runs}: {ANOTHER_FOLDER}; `qrlsuite leaderboard --published` shows what "
-            "comes with the suite"
+            f"there is no results folder {runs}: {ANOTHER_FOLDER}; `qrlsuite leaderboard --published` shows "
+            "the entries that come with the suite"
         )
     stores = entries(runs) if runs.is_dir() else []
     if selection.published:
@@ -403,8 +403,8 @@ def read_entry(store: EntryStore, tuning: bool = False) -> EntryResults | None:
     for probe in probes.of_records(run.record for run in runs):
         if probe.result == probes.DIFFERS:
             raise StoreError(
-                f"{store.path}: not ranked, for its seeds are not independent: trained again, seed {probe.seed} "
-                f"differs in {probe.difference}; `qrlsuite check` looks for the cause"
+                f"{store.path}: not ranked, because its seeds are not independent: trained again, seed "
+                f"{probe.seed} differs in {probe.difference}; `qrlsuite check` looks for the cause"
             )
     asked, withdrawn = requests.read(store)
     facts = {"mark": store.mark, "refused": tuple(refused), "asked": asked, "withdrawn": withdrawn}

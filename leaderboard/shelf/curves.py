@@ -504,7 +504,7 @@ class EntryResults(Shown):
     def first_network_alone(self) -> bool:
         """Whether `parameters` leave out every network but the first, or may do so: an older version counted them.
 
-        DDQN trains one network, and so does REINFORCE unless its baseline is one.
+        DDQN trains one network; REINFORCE trains one, or two with a baseline network.
         """
         algorithm_options = self.identity.get("algorithm_options", {})
         one = {"ddqn": True, "reinforce": algorithm_options.get("baseline") != "value"}.get(
@@ -578,8 +578,8 @@ def edited_between(first: EntryResults, second: EntryResults) -> str:
     if not first.environments or not second.environments or first.environments & second.environments:
         return ""
     return (
-        f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
-        f"'{second.label}': their scores cannot be compared; train the one of the earlier code again"
+        f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' "
+        f"and '{second.label}': their scores cannot be compared; train the entry with the earlier code again"
     )
 
 

@@ -112,7 +112,7 @@ def _agents(store: EntryStore, entry: EntryResults) -> dict[int, Arrays]:
 
 
 def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Mapping[int, Arrays]) -> bool:
-    """Add agents to an entry published without agents, if its curves are those of the agents' runs; return whether."""
+    """Add agents to an entry published without them, if their runs have its curves; return whether they fit."""
     if not folder.exists():
         return False
     there = published.read(folder)

@@ -115,9 +115,9 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     Returns
     -------
     pyarrow.Table
-        The columns are `FIELDS[rows]`, for entries those of `of_entry`, each option, and each metric (`measured.NAME`,
-        averaged like the row's score; of epochs `training.NAME`, too); null if an entry lacks it. A column of whole
-        and other numbers is float64, a column of numbers and texts is text; lists are JSON.
+        The columns are `FIELDS[rows]`, for entries also the ones of `of_entry`, each option, and each metric
+        (`measured.NAME`, averaged like the row's score; of epochs `training.NAME`, too); null if an entry lacks it. A
+        column of whole and other numbers is float64, a column of numbers and texts is text; lists are JSON.
     """
     make: dict[Rows, Callable[[EntryResults], dict[str, Sequence[Any] | NDArray[Any]]]] = {
         "entries": _of_entry,

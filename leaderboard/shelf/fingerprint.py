@@ -30,7 +30,7 @@ class Fingerprint:
     episodes:
         (S, 2): mean and root mean square of the observations with which the first epoch's episodes begin.
     before:
-        (S,): mean score of the untrained agent over a validation's episodes (those of epoch 0).
+        (S,): mean score of the untrained agent over a validation's episodes (at epoch 0).
     """
 
     parameters: Floats

@@ -5,8 +5,8 @@ genuine. Its algorithm is called `external`, so every label shows it, and `impor
 source.
 
 Curves are brought to a grid of equal steps: the score at a grid point is the last observation at or before it. Nothing
-is interpolated, nothing is carried backward, and a curve goes on beyond its last observation only where the user says
-what its early end meant. Entries that were scored in different ways, or whose scales differ tenfold, are not imported.
+is interpolated, nothing is carried backward, and a curve goes on beyond its last observation only where the user
+explains its early end. Entries that were scored in different ways, or whose scales differ tenfold, are not imported.
 """
 
 from __future__ import annotations
@@ -316,9 +316,9 @@ def _scores(
         )
         levels = "thresholds=" + ",".join(f"{part * (best or max(high, 1)):g}" for part in (0.6, 0.75, 0.9))
         raise FileError(
-            f"{source}: '{run[0]}', seed {run[1]}: the score at step {every * (worst + 1)} is {curve[worst]:g}, and "
-            f"scores are not between 0 and {top}. Into a new --task, any scores may come: leave maximum out, and type "
-            f"{levels}"
+            f"{source}: '{run[0]}', seed {run[1]}: the score at step {every * (worst + 1)} is "
+            f"{curve[worst]:g}, and scores are not between 0 and {top}. A new --task takes any scores: "
+            f"leave maximum out, and type {levels}"
         ) from None
     return scores
 

@@ -109,8 +109,8 @@ def import_seeds(source: EntryStore, runs: Path, study: str | None = None) -> Im
     entry = record.entry(str(source.path)) if record.identity.algorithm == SCRIPT else source.entry()
     if entry.study != study:
         raise StoreError(
-            f"{source.path} belongs to a study with looks, whose number of seeds depends on what they showed: it is "
-            "continued by the study alone"
+            f"{source.path} belongs to a study with looks, whose number of seeds depends on their results: "
+            "only the study can continue it"
         )
     held = None if exported is not None else codes.of(source)
     code = exported.record.code_identity if exported is not None else None if held is None else held.first
@@ -164,7 +164,7 @@ def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
     if here and entry.task.hash not in here:
         raise StoreError(
             f"{source.path} was made under another definition of task '{name}' ({entry.task.hash}, here "
-            f"{', '.join(sorted(here))}): its seeds are no seeds of the task that is known here"
+            f"{', '.join(sorted(here))}): its seeds belong to another task than the one here"
         )
 
 
@@ -205,11 +205,11 @@ def unite(
     notes = []
     if differing:
         notes.append(
-            f"seeds {format_seeds(differing)} have other curves in {source} than in {store.path}: these stay, until "
-            "`qrlsuite runs rm` removes the entry"
+            f"seeds {format_seeds(differing)} have other curves in {source} than in {store.path}: yours "
+            "stay, until `qrlsuite runs rm` removes the entry"
         )
     if bare:
-        notes.append(f"seeds {format_seeds(bare)} are longer in {source}, without their agents: these stay")
+        notes.append(f"seeds {format_seeds(bare)} are longer in {source}, without their agents: yours stay")
     if waiting:
         notes.append(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"

@@ -179,7 +179,7 @@ def verify(
     announce(f"{name}: {_cost(made_by, len(places), count, length)}")
     ok, check, message = _train_again(entry, made_by, places, report)
     if check == "verified" and choice is not None:
-        check, message = "repeated", f"{message}; the draw of an earlier check, which proves nothing anew"
+        check, message = "repeated", f"{message}; the draw of an earlier check, which is no new evidence"
     message = "; ".join(filter(None, [message, missing]))
     seeds = tuple(entry.seeds[place] for place in places)
     return VerificationResult(folder, name, ok, check, seeds, message, digest, number)
@@ -201,7 +201,7 @@ def _check_agents(entry: PublishedEntry) -> None:
 
 
 def _parameters(trainer: Trainer) -> tuple[Mapping[str, int], ...]:
-    """Return the numbers of an agent's parameters, and those of its first network alone, which older records have."""
+    """Return the numbers of an agent's parameters, and of its first network alone, which older records have."""
     first = dict(zip(("classical", "quantum", "fixed"), trainer.models.parameters[0]))
     return trainer.models.trained(), first
 

@@ -114,7 +114,7 @@ class DDQN:
         self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
 
     def _hold(self, observations: Tensor) -> None:
-        """Keep current observations, with masks behind them if there are any, and room for such transitions."""
+        """Store the observations, followed by masks if any, and create a replay buffer of their size."""
         self.observations, self.seen_dim = observations, observations.shape[2]
         d = self.seen_dim  # `alive` is 1 - terminated
         self.replay = Replay(

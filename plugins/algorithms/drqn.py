@@ -105,7 +105,7 @@ class DRQN:
         self.validation = self._nothing(0)  # what is remembered in validation: no part of training
 
     def _hold(self, observations: Tensor) -> None:
-        """Keep current observations, with masks behind them if there are any, and room for such steps."""
+        """Store the observations, followed by masks if any, and create a replay buffer of their size."""
         self.observations, self.seen_dim = observations, observations.shape[2]
         # a row is one step: observation, where it arrived, action, reward, 1 - terminated, 1 where an episode begins
         self.columns = 2 * self.seen_dim + 4

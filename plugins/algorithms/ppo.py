@@ -131,12 +131,18 @@ class PPOOptions:
     ] = 0.0
     value_clip: Annotated[
         float | None,
-        Field(gt=0, description="values this far from the collected ones learn no more; absent: all do"),
+        Field(
+            gt=0,
+            description="values stop learning at this distance from the collected ones; absent: no limit",
+        ),
         Since("0.2.0"),
     ] = None
     longest_gradient: Annotated[
         float | None,
-        Field(gt=0, description="norm to which an agent's longer gradients are scaled down; absent: none is"),
+        Field(
+            gt=0,
+            description="longest norm of an agent's gradient; longer ones are scaled down; absent: no limit",
+        ),
         Since("0.2.0"),
     ] = None
     decay_steps: DecaySteps = None

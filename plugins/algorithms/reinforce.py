@@ -27,7 +27,7 @@ Steps lie in slots, (memory + rounds) per environment, and every slot goes throu
 weight 0 if it has no step to learn from. All sums thus run over shapes that do not depend on the lengths of episodes,
 so that each agent is bitwise the agent of a separate training. A model's count of circuit executions includes the
 empty slots, so `memory` should not be longer than episodes are. Compiled networks without circuits see each agent's
-filled slots first, and only as many blocks as one of the agents fills: what is left out would add zeros.
+filled slots first, and only as many blocks as one of the agents fills: further blocks would add zeros.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ class REINFORCEOptions:
         int,
         Field(
             ge=1,
-            description="epochs between updates; from 2 on environments begin anew after each, so that episodes are "
-            "whole and of one policy",
+            description="epochs between updates; from 2 on, environments are reset after each update, so "
+            "that an episode is whole and has one policy",
         ),
         Since("0.2.0"),
     ] = 1
@@ -136,7 +136,7 @@ class Reinforce:
         self.carried_ends = torch.zeros(self.carried.shape[:3], dtype=torch.bool)
 
     def _hold(self, observations: Tensor) -> None:
-        """Keep current observations, with masks behind them if there are any, and room for steps of the kind."""
+        """Store the observations, followed by masks if any, and allocate memory for steps of their size."""
         self.observations, self.seen_dim = observations, observations.shape[2]
         # the steps of unfinished episodes, the last step in the last slot; a row is observation, action, reward
         shape = (self.S, self.E, self.options.memory, self.seen_dim + 2)

@@ -169,7 +169,7 @@ class SAC:
         self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
 
     def _hold(self, observations: Tensor) -> None:
-        """Keep current observations, with masks behind them if there are any, and room for such transitions."""
+        """Store the observations, followed by masks if any, and create a replay buffer of their size."""
         self.observations, seen = observations, observations.shape[2]
         self.replay = Replay(
             self.S, self.options.buffer, self.device,

@@ -308,8 +308,8 @@ def basic(qubits: int, layers: int, options: BasicOptions) -> Circuit:
 
     After its function `build_basic_qlayer`. RX(input[q]) on every qubit, or with `encoding = "basis"` RX(pi input[q]),
     which makes 1 of a bit 1; then in every layer RX(weights[l, q]) and a closed ring of CNOTs (on two qubits a single
-    one). With `linear = false` of a hybrid model the bits are the observation. All rotations are about X, and so are
-    they behind CNOTs: they commute.
+    one). With `linear = false` of a hybrid model the bits are the observation. All rotations are about X, also behind
+    CNOTs: they commute.
     """
     circuit = _begun(qubits, options.entangled)
     weights = circuit.parameter("weights", (layers, qubits))

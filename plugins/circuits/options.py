@@ -130,8 +130,8 @@ class QiskitOptions:
     mitigation: Annotated[
         Literal["none", "readout", "zero-noise"],
         Field(
-            description="Runtime's error mitigation. readout: of wrongly read bits (TREX); zero-noise: of these, and "
-            "of gates, extrapolated from 1, 3 and 5 times the noise"
+            description="Runtime's error mitigation. readout: of wrongly read bits (TREX); zero-noise: of "
+            "wrongly read bits and of gates, extrapolated from 1, 3 and 5 times the noise"
         ),
         Since("0.2.0"),
     ] = "none"

@@ -1,9 +1,9 @@
 """Circuits on any PennyLane device.
 
-Angles are computed in torch for all operations at once (`qrlsuite.circuit.angles`) and enter one QNode on
-PennyLane's broadcast axis, seeds and batch together (lane = s * B + b). `default.qubit` simulates the whole axis
-in one pass and is differentiated by backpropagation, as in the paper; so does `qrlsuite.native`, the suite's own
-simulator, with adjoint gradients. Devices that do not broadcast get PennyLane's own expansion into single circuits.
+Angles are computed in torch for all operations at once (`qrlsuite.circuit.angles`) and enter one QNode on PennyLane's
+broadcast axis, seeds and batch together (lane = s * B + b). `default.qubit` simulates the whole axis in one pass and is
+differentiated by backpropagation, as in the paper. `qrlsuite.native` does the same: the suite's own simulator, with
+adjoint gradients. Devices that do not broadcast get PennyLane's own expansion into single circuits.
 
 With a finite number of shots every seed is executed by itself, on a device seeded for it, and differentiated by
 the parameter-shift rule. PennyLane's rule refuses broadcast circuits, so the shifted angles are put on the

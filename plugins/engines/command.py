@@ -57,11 +57,11 @@ def _template(text: str) -> str:
     try:
         names = [name for _, name, _, _ in string.Formatter().parse(text) if name is not None]
     except ValueError as error:
-        raise ValueError(f"{error}; a brace that the shell is to see is doubled: {{{{ and }}}}") from None
+        raise ValueError(f"{error}; double a brace that the shell must see: {{{{ and }}}}") from None
     for name in names:
         if name not in PLACEHOLDERS:
             raise ValueError(
-                f"there is no {{{name}}}{nearest(name, PLACEHOLDERS)}; a brace that the shell is to see is doubled"
+                f"there is no {{{name}}}{nearest(name, PLACEHOLDERS)}; double a brace that the shell must see"
             )
     if not {"command", "quoted"} & set(names):
         raise ValueError(

@@ -86,9 +86,7 @@ class DaskOptions:
             "processes is started on this machine"
         ),
     ] = None
-    timeout: Annotated[
-        float, pydantic.Field(gt=0, description="seconds for which the scheduler is waited for")
-    ] = 10.0
+    timeout: Annotated[float, pydantic.Field(gt=0, description="seconds to wait for the scheduler")] = 10.0
 
 
 def work(mark: str, arguments: Sequence[str], environment: Mapping[str, str]) -> bytes:
@@ -197,7 +195,7 @@ class DaskEngine:
             for job, code in cluster.ended():
                 lost = code == 3 and job.name in begun  # the seeds are still those of the worker before
                 if code == 0 and not job.finished():
-                    job.said("it ended, and this machine does not see all that it trained")
+                    job.said("it ended, but this machine does not see all of its results")
                     code = 1
                 if lost or job.ended(code, outcome):
                     waiting.append(job)

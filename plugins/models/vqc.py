@@ -132,8 +132,8 @@ class VQCOptions:
     input_reuse: Annotated[
         bool,
         Field(
-            description="without linear layers, where the circuit has more inputs than there are observations: it is "
-            "given these again, in their order"
+            description="without linear layers, where the circuit has more inputs than there are "
+            "observations: it gets the observations again, in their order"
         ),
         Since("0.2.0"),
     ] = False
@@ -400,7 +400,7 @@ class VQC(_Hybrid):
 class VQCPopulation(_Hybrid):
     """S hybrid models: (S, B, in) -> (S, B, out); parameters and buffers as in `VQC` with a leading axis S.
 
-    `compiled`: all of a network is one compiled sweep on the CPU, and so is Adam's step.
+    `compiled`: all of a network is one compiled sweep on the CPU, and Adam's step is compiled, too.
     """
 
     def __init__(self, modules: Sequence[VQC], options: VQCOptions) -> None:

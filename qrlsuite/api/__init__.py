@@ -16,7 +16,7 @@
     api.run_study("width.toml")
     api.power("mlp width=16")
 
-Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
+Results are shown as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
 from `qrlsuite.errors`; if a message names an option of a command, such as `--task`, the function's argument has that
 name.
 """

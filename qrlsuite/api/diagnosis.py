@@ -56,7 +56,7 @@ class Scanned:
     frequencies, power:
         The spectrum along its inputs, see `qrlsuite.diagnostics.circuits.spectrum`.
     expressibility, entanglement:
-        NaN where the bins of the fidelities tell nothing.
+        NaN where nearly all fidelities fall into one bin.
     algebra:
         Dimension of the dynamical Lie algebra.
     """
@@ -187,8 +187,9 @@ class CircuitDiagnosis(Shown):
             (*heads, "local", "5% to 95%", "global", "5% to 95%"),
             rows,
             (
-                f"of a derivative by a parameter, mean over those that have an effect; {self.draws} draws; local: Z of "
-                "qubit 0, global: product of all Z; interval: bootstrap over draws",
+                "of a derivative by a parameter, mean over the parameters that have an effect; "
+                f"{self.draws} draws; local: Z of qubit 0, global: product of all Z; interval: bootstrap "
+                "over draws",
                 "\n".join(laws),
             )[: 1 + bool(laws)],
         )
@@ -455,9 +456,9 @@ def diagnose(
 ) -> AgentsDiagnosis:
     """Diagnose the best trained agents of entries, beside the same agents before training.
 
-    They play fresh episodes; where they were, their networks are looked at: Fisher information with directions without
-    effect, effective dimension, spectrum along the inputs, and of circuits the entanglement of their states. Networks
-    without a circuit have all but the last.
+    They play fresh episodes. At the observations that they visit, their networks are examined: Fisher information with
+    directions without effect, effective dimension, spectrum along the inputs, and the entanglement of the states of
+    circuits.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ def load(
     Raises
     ------
     UnknownNameError
-        If no entry or several have the name, or no epoch of it is finished; the message says what to type.
+        If no entry or several have the name, or no epoch of it is finished; the message names the next command.
     StoreError
         If there is no results folder, or a file is damaged.
 
@@ -109,8 +109,8 @@ def board(
     horizon:
         Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
     entries:
-        Show these only: what `load` accepts. They keep the ranks that they have among all entries of their task. What
-        `load` returns is compared by itself, without others; and so is all by cost, for the cheapest entry sets the
+        Show these only: arguments of `load`. They keep their ranks among all entries of their task. Results of `load`
+        are compared only with each other; and by cost, named entries are, too, because the cheapest entry sets the
         budget.
     study:
         Rank the entries of this study only: its name, or a study file's path.
@@ -250,7 +250,7 @@ def compare(
     rule:
         Judges the cells of the task's grid, too, at equal numbers of seeds: `paper`, or a name of `list rules`.
     by:
-        What the sentence begins with: `steps`, `score`, `area`, `spread`, or a cost that the task names.
+        The number that decides the verdict: `steps`, `score`, `area`, `spread`, or a cost that the task names.
     labels:
         As for `board`.
 

@@ -170,9 +170,9 @@ def evaluate(
         Whether to show a bar.
     backend:
         Play every entry with its circuits on this backend, too: `qiskit shots=1000`, see
-        `qrlsuite.training.deployment`. What this costs is said first; finished episodes are kept.
+        `qrlsuite.training.deployment`. The cost is printed first; finished episodes are kept.
     yes:
-        Execute circuits on a device that is no simulator.
+        Execute circuits on a real device.
     perturb:
         Play every entry with its parameters perturbed by each of these relative sizes, too.
 
@@ -199,7 +199,7 @@ def evaluate(
     for each, store in zip(deployed, stores):
         cost = each.cost(episodes, seed, steps_per_episode(store, best, episodes, seed, device, on))
         if not each.simulator and not yes:
-            raise OptionError(f"{each.name} is no simulator: {cost}; add --yes to execute them")
+            raise OptionError(f"{each.name} is not a simulator: {cost}; add --yes to execute them")
         console.print(f"{each.name}: {cost}", soft_wrap=True)
     bar = Bar(console, TimeRemainingColumn())
 
@@ -274,7 +274,7 @@ def find(selection: Selection, name: str) -> EntryStore:
         except UnknownNameError:
             raise error from None
         raise UnknownNameError(
-            f"task '{selection.tasks[0]}' has no entry '{name}' in {selection.runs}; to let agents play it that were "
+            f"task '{selection.tasks[0]}' has no entry '{name}' in {selection.runs}; if its agents were "
             f"trained on '{other}', write '{other}/{name}'"
         ) from None
     chosen = collect.best([copy for copy in copies if _has_agents(copy)] or copies)
@@ -294,6 +294,7 @@ def _one_task(stores: Sequence[EntryStore]) -> None:
     tasks = {record.task_hash: record.task_name for record in (store.record() for store in stores)}
     if len(tasks) > 1:
         raise OptionError(
-            f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes and sums "
-            "cannot be compared: evaluate them one by one, or say which task all play, --task TASK"
+            f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes "
+            "and sums cannot be compared: evaluate them one by one, or name the task that all play: --task "
+            "TASK"
         )

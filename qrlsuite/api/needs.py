@@ -137,8 +137,9 @@ def power(
     grid = ranked.ranking_of(entries).grid
     if mean_time(curves[0], grid).at_cap.min() == 1:
         raise OptionError(
-            f"no seed of '{entries[0].label}' reached a threshold within {horizon} steps, so nothing can be simulated "
-            "that is slower: train longer, change the task's thresholds, or name another entry first"
+            f"no seed of '{entries[0].label}' reached a threshold within {horizon} steps, so no slower "
+            "entry can be simulated: train longer, change the task's thresholds, or name another entry "
+            "first"
         )
     per_pair = _core_hours(entries, horizon // curves[0].steps_per_epoch)
     console = Console(stderr=True, quiet=not progress, highlight=False)
@@ -179,8 +180,8 @@ class StudyPower:
         """Say the power of the pairs at the last look, and the power of each claim at every look."""
         shares = ", ".join(f"{lead:.0%} fewer in {100 * each[-1]:.0f}" for lead, each in self.found.items())
         pairs = (
-            f"power: of 100 such studies, this many find an entry that needs fewer steps than every other: {shares}; "
-            f"if seeds differ as the {self.seeds} of {self.pilot} do"
+            "power: how many of 100 such studies find an entry that needs fewer steps than all others: "
+            f"{shares}; if seeds differ as the {self.seeds} of {self.pilot} do"
         )
         claims = [
             f"power at each look: of 100 such studies, this many establish: {claim}: "
@@ -230,7 +231,7 @@ def _spreads(entries: Iterable[EntryResults], study: Study) -> list[tuple[float,
 
 
 def power_lines(power: StudyPower | None) -> list[str]:
-    """Return the sentences of a study's power, or the one that says what is lacking."""
+    """Return the sentences of a study's power, or one that names the missing seeds."""
     if power is None:
         return [f"power: unknown until {PILOT} seeds of an entry of this task are trained to the end"]
     return power.sentences
@@ -258,7 +259,7 @@ def _jobs(
 
 
 def _core_hours(entries: Sequence[EntryResults], epochs: int) -> float | None:
-    """Return the core-hours of a seed of each of two entries together; None where one has curves without times."""
+    """Return the core-hours of a pair of seeds, one from each entry; None where an entry has curves without times."""
     each = [
         epochs * entry.hours / sum(len(run.scores) for run in entry.records.values())
         for entry in (entries[0], entries[-1])

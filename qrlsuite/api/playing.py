@@ -1,4 +1,4 @@
-"""Trained agents: as a policy, and how one plays, seen."""
+"""Trained agents: as a policy, or in an animated episode."""
 
 from __future__ import annotations
 

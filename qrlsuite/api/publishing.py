@@ -93,7 +93,7 @@ def export(
     with_looks = [study for study in named.values() if study.looks is not None]
     if 0 < len(named) < len(names) or 0 < len(with_looks) < len(named):
         raise OptionError(
-            "export entries, studies and studies with looks by commands of their own: they go to different folders"
+            "export entries, studies and studies with looks with separate commands: they go to different folders"
         )
     if with_looks:
         for study in with_looks:
@@ -120,7 +120,7 @@ def export(
             written += 1
             yield Exported(entry, folder)
     if not written:
-        raise QrlSuiteError(f"no entry was exported: qrlsuite runs --runs {runs} lists those of {runs}")
+        raise QrlSuiteError(f"no entry was exported: qrlsuite runs --runs {runs} lists the entries of {runs}")
 
 
 def _is_study(name: str) -> bool:
@@ -195,5 +195,5 @@ def _read_study(folder: Path) -> dict[str, Any]:
         outcome = published_studies.read(folder)
     except QrlSuiteError as error:
         return {**content, "ok": False, "message": str(error)}
-    message = f"study sound: {len(outcome.pairs)} pairs, its verdicts computed again"
+    message = f"study sound: the verdicts of {len(outcome.pairs)} pairs computed again"
     return {**content, "ok": True, "message": message}

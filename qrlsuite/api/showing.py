@@ -148,7 +148,9 @@ def _ansatz(
 def _code_of_plugin(kind: type[specs.Spec], name: str) -> dict[str, Any]:
     """Return a registered thing's part of an entry's identity: its files or `numerics`."""
     if not issubclass(kind, specs.NumericSpec):
-        raise OptionError(f"{specs.title(kind, name)} computes nothing of an entry, and has no code identity")
+        raise OptionError(
+            f"{specs.title(kind, name)} computes nothing for an entry, so it has no code identity"
+        )
     return dict(identity.of_registered(kind, name, None))
 
 

@@ -188,7 +188,7 @@ def run_study(
 ) -> Overview | State:
     """Train a study's missing seeds, the entry that lacks least first.
 
-    Entries and their folders are those of `train`: nothing is trained twice. A study with looks has seeds of its own,
+    `train` uses the same entries and folders: nothing is trained twice. A study with looks has seeds of its own,
     which are trained look by look, until every pair is decided or the last look was taken. Interrupt it at any time:
     the same call continues, and ends with the same verdicts.
 

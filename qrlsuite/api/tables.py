@@ -66,8 +66,8 @@ def table(
         `training.loss` and `training.return`.
 
         At last every option, such as `model.width`, `algorithm.lr` and `environment.degree`: null where an entry does
-        not have it, or has the default of an option that came later; JSON where it is a list. The schema's metadata say
-        what columns mean.
+        not have it, or has the default of an option that came later; JSON where it is a list. The schema's metadata
+        describe the columns.
 
     Raises
     ------

@@ -75,7 +75,7 @@ class TrainedAgent:
         wanted = None if self._choices is None else (len(seen), self._choices)
         if wanted is not None and np.shape((infos or {}).get("action_mask", ())) != wanted:
             raise OptionError(
-                f"task '{self.task}' says what can be chosen: give act() the infos of the environments, whose "
+                f"task '{self.task}' has action masks: give act() the infos of the environments, whose "
                 f"'action_mask' has the shape {wanted} here"
             )
         try:
@@ -107,7 +107,7 @@ class TrainedAgent:
         if seen.ndim == 0 or len(seen) == 0 or seen.shape[1:] not in ((size,), whole):
             raise OptionError(f"observations of shape {seen.shape}: {said}")
         if not np.isfinite(seen).all():
-            raise OptionError("observations are not finite: the agent has seen none like these")
+            raise OptionError("observations must be finite numbers")
         return seen
 
 

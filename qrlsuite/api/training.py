@@ -69,7 +69,8 @@ def train(
         One of the task's presets of settings, or a preset file's path.
     start:
         An entry with trained agents, of the results folder or published: seed k begins with the agent of seed k, and
-        its optimizer and all else are fresh. It is part of the entry, which never shares seeds with one without.
+        its optimizer and all else are fresh. It is part of the entry, so the entry shares no seeds with an entry that
+        begins without agents.
     seeds:
         A number (100: seeds 0 to 99), the seeds themselves, or text ('0:20'); None takes the task's protocol.
     epochs:
@@ -86,7 +87,7 @@ def train(
     track:
         Trackers that watch, `NAME` or `NAME=TARGET`.
     same:
-        Where the code has changed: your word that nothing changed in effect, as a reason; the old seeds are continued.
+        After a change of code: your word that results do not change, as a reason; the old seeds are continued.
         Without it, seeds of the changed code are another entry, with a mark such as `@1a2b3c4d` behind its name.
     runs:
         The results folder.
@@ -168,7 +169,8 @@ def train_entry(
     if entry.script is not None:
         if track or start is not None or where.device != "cpu":
             raise OptionError(
-                f"'{entry.label}': trackers, --device and --from are the script's own affair: write them in its command"
+                f"'{entry.label}': the script itself handles trackers, --device and --from: write them in "
+                "its command"
             )
         entry = entry if epochs is None else entry.for_epochs(epochs)
     seed_numbers = None if seeds is None else read_seeds(seeds)
@@ -320,7 +322,7 @@ def evaluate(
         Let them play with perturbed parameters, too: each trained number times 1 + perturb * z, z standard normal, for
         every size that is given.
     yes:
-        Execute circuits on a device that is no simulator.
+        Execute circuits on a real device.
     published:
         Look among the published entries that come with the suite, too.
     runs:

@@ -113,7 +113,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     name:
         Name of the ansatz: `qrlsuite list ansatzes`.
     qubits, layers:
-        Size of the circuit: 1 or more of each. How many qubits can be simulated is the backend's to say.
+        Size of the circuit: 1 or more of each. The backend limits the number of qubits.
     options:
         Options of the ansatz, such as `gate="rot"`.
 

@@ -1,8 +1,8 @@
-"""What the outputs of a circuit can depend on, by its structure: no circuit is run.
+"""Finds, from its structure alone, the parameters and inputs on which a circuit's outputs can depend.
 
 Observables go back through the gates, and the initial state goes forward, as the Paulis that either may hold on each
 qubit. A gate that commutes with all of them changes nothing, whatever the parameters: RZ right before Z is measured,
-say, or any gate outside of the light cone of an observable. A parameter that is said to be dead is dead. The converse
+say, or any gate outside of the light cone of an observable. A parameter that is reported as dead is dead. The converse
 may fail: Paulis are kept qubit by qubit, without their correlations.
 """
 
@@ -57,7 +57,7 @@ def uses(circuit: Circuit) -> list[Use]:
 
 
 def _seen(circuit: Circuit) -> list[set[int]]:
-    """Return of each observable the inputs on which it may depend."""
+    """Return, for each observable, the inputs on which it may depend."""
     found: list[set[int]] = [set() for _ in circuit.observables]
     for use in uses(circuit):
         for inputs, reached in zip(found, use.observables):
@@ -66,7 +66,7 @@ def _seen(circuit: Circuit) -> list[set[int]]:
 
 
 def described(circuit: Circuit, build: Callable[[int], Circuit]) -> dict[str, str]:
-    """Describe what reaches the outputs of a circuit, in words.
+    """Describe which inputs and parameters reach a circuit's outputs, in words.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The matrices of Pauli, and those of the gates of `qrlsuite.circuit.GATES`."""
+"""The Pauli matrices, and the matrices of the gates in `qrlsuite.circuit.GATES`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a network with a circuit offers beside a `torch.nn.Module`."""
+"""The attributes of a network with a circuit, beside the ones of `torch.nn.Module`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class CircuitModel(Protocol):
     epoch, evaluates the agents on other backends and diagnoses them. A network that has `executions` must
     have the others, too.
 
-    Where it says `draws`, outputs or gradients are random, and `qrlsuite check` compares none of two passes.
+    If its `draws` is true, outputs or gradients are random, and `qrlsuite check` does not compare two passes.
     """
 
     @property
     def executions(self) -> ExecutionCounter:
-        """What each agent has executed so far; deep copies share it."""
+        """Counts each agent's executions so far; deep copies share it."""
         ...
 
     @property

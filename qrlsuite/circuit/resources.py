@@ -11,7 +11,7 @@ from qrlsuite.circuit.description import Circuit, Operation, in_bases
 
 @dataclass(frozen=True)
 class Resources:
-    """What a circuit takes, in the gates of its definition.
+    """The resources of a circuit, in the gates of its definition.
 
     Attributes
     ----------

@@ -45,7 +45,9 @@ BUILT_IN = {
     for command in (
         LazyCommand("demo", "Train three models and compare them: 2 minutes.", f"{_ROOM}.demo:demo"),
         LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
-        LazyCommand("runs", "List the results folder, and what is running in it.", f"{_ROOM}.runs:app"),
+        LazyCommand(
+            "runs", "List the entries of the results folder, and their progress.", f"{_ROOM}.runs:app"
+        ),
         LazyCommand(
             "leaderboard",
             "Rank entries by significant outperformance.",
@@ -62,9 +64,7 @@ BUILT_IN = {
         LazyCommand(
             "evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"
         ),
-        LazyCommand(
-            "diagnose", "Gradients, Fisher information, entanglement, ...", f"{_ROOM}.diagnose:diagnose"
-        ),
+        LazyCommand("diagnose", "Analyze circuits or trained agents.", f"{_ROOM}.diagnose:diagnose"),
         LazyCommand("play", "Show an episode of a trained agent.", f"{_ROOM}.play:play"),
         LazyCommand("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
         LazyCommand(
@@ -79,7 +79,9 @@ BUILT_IN = {
         LazyCommand("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
         LazyCommand("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
         LazyCommand("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
-        LazyCommand("doctor", "Collect what a bug report needs.", f"{_ROOM}.doctor:doctor"),
+        LazyCommand(
+            "doctor", "Check the installation; print facts for a bug report.", f"{_ROOM}.doctor:doctor"
+        ),
         LazyCommand("study", "Run a paper's experiments, or your own, by name.", f"{_ROOM}.study:app"),
         LazyCommand("power", "Say how many seeds find a difference.", f"{_ROOM}.power:power"),
         LazyCommand("new", "Write a new plugin package.", f"{_ROOM}.new:app"),
@@ -91,7 +93,7 @@ PluginOption = Annotated[
     typer.Option(
         "--plugin",
         metavar="PATH",
-        help="Use a plugin that lies there: a file, or the folder of a package, a project or an entry. Repeatable.",
+        help="Load a plugin: a file, or the folder of a package, a project or an entry. Repeatable.",
         expose_value=False,
     ),
 ]

@@ -53,7 +53,7 @@ TasksOption = Annotated[
     list[str] | None,
     typer.Option(
         "--task",
-        help="Only this task. Repeat it to compare entries that were trained on all these tasks, by means.",
+        help="Only this task. Repeat it to compare entries by their means over several tasks.",
         autocompletion=names_of("tasks"),
     ),
 ]
@@ -94,7 +94,8 @@ RuleOption = Annotated[
     typer.Option(
         "--rule",
         metavar="NAME",
-        help="Rule of significance: qrlsuite list rules; default: the task's, else intervals.",
+        help="Also judge the cells of the task's grid by this rule: paper, or a name of `qrlsuite list "
+        "rules`.",
     ),
 ]
 AlphaOption = Annotated[

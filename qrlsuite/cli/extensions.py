@@ -38,7 +38,7 @@ def _added(
     """Return the commands and groups that were added to the earlier ones."""
     first, second = app.registered_commands[: len(commands)], app.registered_groups[: len(groups)]
     if first != commands or second != groups or app.registered_callback is not callback:
-        raise PluginError("it changes the commands of others or the callback, and may only add commands")
+        raise PluginError("it changes other commands or the callback, but may only add commands")
     return app.registered_commands[len(commands) :], app.registered_groups[len(groups) :]
 
 

@@ -44,6 +44,6 @@ SameOption = Annotated[
     typer.Option(
         "--same",
         metavar="REASON",
-        help="Where the code has changed: your word that nothing changed in effect; the old seeds are continued.",
+        help="After a change of code: your word that results do not change; the old seeds are continued.",
     ),
 ]

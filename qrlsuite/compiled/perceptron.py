@@ -136,7 +136,7 @@ class Sweep(ABC):
         return self.kept_gradients
 
     def show_gradients(self) -> None:
-        """Let `grad` of trained parameters be what is in `own_gradients`."""
+        """Let `grad` of the trained parameters be their arrays in `own_gradients`."""
         for tensor, part in zip(self.tensors, self._kept_parts):
             tensor.grad = part if tensor.requires_grad else None
 
@@ -206,7 +206,7 @@ class LayersSweep(Sweep):
         self._pull(records, cotangents, gradients, x_gradient)
 
     def pull_x(self, records: Records, cotangents: Array) -> Array:
-        """Return the gradient of x alone, without those of the parameters."""
+        """Return the gradient of x alone, without gradients of parameters."""
         x_gradient = np.empty((*cotangents.shape[:2], self.inputs), np.float32)
         self._pull(records, cotangents, None, x_gradient)
         return x_gradient

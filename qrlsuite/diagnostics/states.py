@@ -4,7 +4,7 @@
   to 1 where every qubit is maximally entangled with the rest;
 - the half-cut entropy: the von Neumann entropy, in bits, of the first n // 2 qubits, from 0 to n // 2;
 - expressibility (after Sim, Johnson & Aspuru-Guzik 2019, arXiv:1905.10876): the divergence of the fidelities of random
-  pairs of states from those of states drawn by Haar's measure.
+  pairs of states from the fidelities of states drawn by Haar's measure.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ class CostEstimate:
         self._began = False
 
     def _span(self, name: str) -> int:
-        """Return the number of epochs of each of a group's turns."""
+        """Return the number of epochs in each turn of a group."""
         return self.epochs - self.groups[name].epoch
 
     def remaining(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> float | None:
@@ -165,7 +165,7 @@ class CostEstimate:
 
     @property
     def settled(self) -> bool:
-        """Whether the pace of some group is that of epochs."""
+        """Whether the pace of some group was measured over epochs."""
         return any(clock.settled for clock in self._clocks.values())
 
 
@@ -298,7 +298,7 @@ class RunDisplay:
         )
         if self.new_folder:
             self._say(
-                f"results go to the new folder {self.missing.runs.absolute()}; "
+                f"results are in the new folder {self.missing.runs.absolute()}; "
                 f"{'--runs or QRLSUITE_RUNS' if self.again == 'command' else '`runs`'} names another"
             )
         todo = sum(len(group.seeds) for group in self.groups)
@@ -397,7 +397,8 @@ class RunDisplay:
             self._advised, self.endless = True, left > DAY
             if left > 3600:
                 self._say(
-                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; all that is trained counts"
+                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; every trained seed "
+                    "counts"
                 )
 
     def close(self) -> None:
@@ -449,8 +450,8 @@ class RunDisplay:
             )
         if summary["diverged"]:
             self._say(
-                f"{summary['diverged']} of them diverged: numbers of their agents are no longer finite. They stay in "
-                "the results with the scores that they had; a smaller learning rate is the usual cure"
+                f"{summary['diverged']} of them diverged: numbers of their agents are no longer finite. "
+                "They stay in the results with their scores; a smaller learning rate is the usual cure"
             )
         protocol_seeds = self.entry.task.file.protocol.seeds
         if summary["seeds"] < protocol_seeds:

@@ -51,7 +51,7 @@ class WorkerJob:
         self.output: IO[bytes] | None = None
 
     def claimed(self, claims: Iterable[Claim]) -> bool:
-        """Return whether somebody trains seeds of the group, by what `held` returned."""
+        """Return whether somebody trains seeds of the group, by the result of `held`."""
         entry, seeds = self.work.store.path, set(self.group.seeds)
         return any(claim.path.is_relative_to(entry) and seeds & set(claim.seeds) for claim in claims)
 

@@ -85,15 +85,13 @@ def _require_one_command(runs: Path, entry: Entry) -> None:
 def settle_codes(
     runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False
 ) -> list[CodeIdentity]:
-    """Return the code of each entry; say of which ones earlier seeds are of another code, unless `quiet`.
+    """Return the code of each entry; print which entries have earlier seeds of another code, unless `quiet`.
 
     A study with looks is refused then. With `where.same`, the codes are linked, once a checkpoint was loaded.
     """
     reason = where.same
     if reason is not None and (not reason.strip() or not reason.isprintable()):
-        raise OptionError(
-            "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
-        )
+        raise OptionError("--same: say in one line why results do not change, for example --same 'renamed'")
     for entry in entries:
         script.require_typed(entry)
     anew, found = [], [identity.of(entry) for entry in entries]
@@ -108,11 +106,11 @@ def settle_codes(
             if entry.study is not None:
                 raise codes.ChangedCodeError(
                     f"{seeds}: {codes.change(before, code)}. Nothing was trained. Restore that code, or write another "
-                    'study; and --same "REASON" says that nothing changed in effect'
+                    'study, or say with --same "REASON" that results do not change'
                 )
             anew.append(
-                f"{seeds}: {codes.change(before, code)}. Begun anew is '{entry.label} {store.mark}'; --same \"REASON\" "
-                "continues the old seeds, if nothing changed in effect"
+                f"{seeds}: {codes.change(before, code)}. Training starts over as '{entry.label} {store.mark}'; "
+                '--same "REASON" continues the old seeds, if results do not change'
             )
     if anew:
         more = f" (and so for {counted(len(anew) - 1, 'more entry')})" if len(anew) > 1 else ""
@@ -122,7 +120,7 @@ def settle_codes(
 
 
 def prepare(work: Missing) -> None:
-    """Create the entry's folder, if need be, and write down what was asked for and which code trains it."""
+    """Create the entry's folder, if need be, and write down the requested seeds and the code that trains them."""
     EntryStore.create(work.runs, work.entry, work.store.mark)
     if work.groups:
         code = work.code or identity.of(work.entry)

@@ -294,11 +294,11 @@ class Probe:
             found = f"that it fails: {error}"
         if found:
             raise probes.DependentSeedsError(
-                f"seed {self.seed} is not what it was: trained again in a fresh process, it differs from its record "
-                f"({self.recorded.path}) in {found}. Something has changed since: the code, if --same joined two; a "
-                "file that the plugin reads and does not declare, another package, a variable of the environment. "
-                "Nothing was trained, and nothing is lost: restore it and repeat the command, or begin anew with "
-                "--runs DIR"
+                f"seed {self.seed} has changed: trained again in a fresh process, it differs from its "
+                f"record ({self.recorded.path}) in {found}. Something has changed since: the code, if "
+                "--same joined two; a file that the plugin reads and does not declare, another package, a "
+                "variable of the environment. Nothing was trained, and nothing is lost: restore it and "
+                "rerun the command, or start over with --runs DIR"
             )
         return ""
 

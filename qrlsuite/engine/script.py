@@ -70,7 +70,7 @@ def require_typed(entry: Entry) -> None:
 
 
 def words(entry: Entry) -> list[str]:
-    """Return the words of a worker's command line that hand over what is to be started; none for other entries."""
+    """Return the words of a worker's command line that hand over the script's command; none for other entries."""
     require_typed(entry)
     if entry.script is None:
         return []
@@ -128,7 +128,7 @@ class _Run:
         self._before = self._files()
 
     def _files(self) -> dict[Path, tuple[int, int]]:
-        """Return the files that the pattern names, with time and size: those of earlier runs do not change."""
+        """Return the files that the pattern names, with time and size: files of earlier runs do not change."""
         found = {}
         for path in self.script.files(self.seed, self.folder):
             with contextlib.suppress(OSError):
@@ -204,13 +204,13 @@ class _Run:
         scores = settled(values / best)
         if self.file.ranking.thresholds is None and not ((scores > -1e-6) & (scores < 1 + 1e-6)).all():
             raise QrlSuiteError(
-                f"{self.name}: its scores go from {values.min():g} to {values.max():g}, and those of the task from 0 "
+                f"{self.name}: its scores go from {values.min():g} to {values.max():g}, the task's from 0 "
                 f"to {best:g}"
             )
         return scores
 
     def _curve(self) -> tuple[NDArray[np.float64], dict[str, Any]]:
-        """Return the scores after each epoch (T,), each the last at or before its end; and from what they are."""
+        """Return the scores after each epoch (T,), each the last at or before its end; and their source."""
         found, every = self._points(), self.file.protocol.interactions
         scores = self._on_grid(found, self.entry.epochs)
         last, steps = int(found.steps[-1]), every * self.entry.epochs

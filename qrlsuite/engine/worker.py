@@ -131,9 +131,9 @@ def train_group(
             run.progress.turn, run.progress.turns = turn, len(pieces)
             if state.size < most:
                 run.progress.warnings.append(
-                    f"{counted(state.size, 'seed')} at a time instead of {most}: with more, the process was killed "
-                    "before an epoch ended, as happens where memory is used up; other entries of this size begin so "
-                    f"with --seeds {format_seeds(seeds[: state.size])}"
+                    f"{counted(state.size, 'seed')} at a time instead of {most}: with more, the process was "
+                    "killed before an epoch ended, as happens where memory is used up; for other entries "
+                    f"of this size, begin with --seeds {format_seeds(seeds[: state.size])}"
                 )
             places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress

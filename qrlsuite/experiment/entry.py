@@ -371,7 +371,7 @@ def option_sides(
 def _require_not_of_another_ansatz(
     settings: Sequence[Setting], sides: Mapping[str, type[Any]], chosen: str
 ) -> None:
-    """Refuse an option that no side has but some other ansatz: the list of known names would not say so."""
+    """Refuse an option that only another ansatz has: the list of known names would not say so."""
     option_names = {name for side in sides.values() for name in options.field_names(side)}
     for setting in settings:
         if setting.side is not None or setting.name in option_names:

@@ -89,7 +89,7 @@ class TuningRecord(options.Table):
 
     @model_serializer(mode="wrap")
     def _without_unknown(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what is not known and came later: hashes of older studies cover records without it."""
+        """Leave out unknown fields of later versions: hashes of older studies cover records without it."""
         content: dict[str, Any] = write(self)
         return {name: value for name, value in content.items() if name not in _LATER or value is not None}
 

@@ -50,14 +50,14 @@ OfSeed = Annotated[str, AfterValidator(_of_a_seed), Field(max_length=10_000)]
 
 @dataclass(frozen=True, kw_only=True, config={"extra": "forbid"})
 class Script(Scale):
-    """Options of a script's entry; those of `Scale` define a task that the suite does not know.
+    """Options of a script's entry; the options of `Scale` define a task that the suite does not know.
 
     Attributes
     ----------
     command:
         Started without a shell; `{seed}` and `{steps}` are filled in.
     steps:
-        Environment steps of a run; those of the task's protocol by default.
+        Environment steps of a run; by default the task's protocol.
     curve:
         Pattern of the files with a run's curve: csv, or a file of `qrlsuite.results.run_files`.
     kind:

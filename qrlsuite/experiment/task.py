@@ -157,7 +157,8 @@ class ScoreSection(options.Table):
         ),
     ] = None
     goal: Annotated[
-        Goal, Field(description="above: a metric is to be the threshold or more; below: that or less")
+        Goal,
+        Field(description="above: a metric should reach the threshold or more; below: the threshold or less"),
     ] = "above"
 
     @model_serializer(mode="wrap")
@@ -171,7 +172,7 @@ class ScoreSection(options.Table):
     @model_validator(mode="after")
     def _of_one_source(self) -> ScoreSection:
         if self.metric is None and self.goal == "below":
-            raise ValueError("goal = 'below' is for a metric: scores and returns are to be high")
+            raise ValueError("goal = 'below' is for a metric: scores and returns should be high")
         if self.metric is not None and (self.source == "return" or self.max_return is not None):
             raise ValueError(
                 f"metric = '{self.metric}' comes from the environment's info: source = \"info\", without max_return"

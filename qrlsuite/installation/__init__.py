@@ -105,7 +105,7 @@ def _packages(diagnosis: Diagnosis) -> None:
         else:
             if requirement.specifier.contains(versions[name], prereleases=True):
                 continue
-            problem = f"{versions[name]} is installed, and does not fit"
+            problem = f"{versions[name]} is installed, but does not fit"
         if not extra:
             diagnosis.broken.append(f"{name} {problem}: pip install '{name}{requirement.specifier}'")
     diagnosis.facts["packages"] = ", ".join(f"{name} {version}" for name, version in versions.items())
@@ -143,7 +143,7 @@ def _plugins(diagnosis: Diagnosis) -> None:
     known = registry.load()
     own = [plugin for plugin in known.plugins if plugin.distribution == "qrlsuite"]
     if not own:
-        diagnosis.broken.append("the suite's own models and tasks are not there: install it again, with pip")
+        diagnosis.broken.append("the suite's own models and tasks are missing: install it again, with pip")
     diagnosis.broken += [plugin.problem for plugin in own if plugin.problem]
     diagnosis.remarks += [line for line in known.problems if not line.startswith(tuple(diagnosis.broken))]
     others = {
@@ -158,7 +158,7 @@ def _plugins(diagnosis: Diagnosis) -> None:
 
 
 def _engine(spec: EngineSpec) -> str:
-    """Return an engine's name, with what to type where a package that it needs is not installed."""
+    """Return an engine's name, with the command to type where a package that it needs is not installed."""
     missing = [command for module, command in spec.extras.items() if importlib.util.find_spec(module) is None]
     return f"{spec.name} ({', '.join(missing)})" if missing else spec.name
 

@@ -1,9 +1,9 @@
 """The code that an entry's seeds are of, which is part of the entry's name, and the copies of plugins in its folder.
 
-Under `code`, `run.json` has the identity of the code that began the seed, and `entry.json` that of the code that trains
-now. A folder is of the code of its first seed, and of codes that `--same` links to it (`same` in `entry.json`). Seeds
-of other code lie beside it, in `NAME@1a2b3c4d`. Older seeds have no identity: they have the suite's first bits, or
-unknown code of a plugin.
+Under `code`, `run.json` has the identity of the code that began the seed, and `entry.json` the identity of the code
+that trains now. A folder is of the code of its first seed, and of codes that `--same` links to it (`same` in
+`entry.json`). Seeds of other code lie beside it, in `NAME@1a2b3c4d`. Older seeds have no identity: they have the
+suite's first bits, or unknown code of a plugin.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def environments(codes: Iterable[CodeIdentity | None]) -> frozenset[str]:
 
 
 def require(store: EntryStore, current: CodeIdentity, host: str) -> None:
-    """Refuse to train a folder with other code than that of its seeds, or of the machine that started the training."""
+    """Refuse to train a folder with code that differs from its seeds' code, or from the starting machine's code."""
     sent = store.record().code_identity
     if sent is not None and sent != current:
         differing = listed(identity.differences(sent.parts, current.parts))
@@ -238,7 +238,7 @@ def load_copies(store: EntryStore) -> list[own.Loaded]:
     for source in sources:
         if source.mark != source.path.parent.name:
             raise StoreError(
-                f"{source.path} is not what it was when it was copied: restore it, or give the plugin itself with "
+                f"{source.path} has changed since it was copied: restore it, or give the plugin itself with "
                 "--plugin FILE"
             )
     return [own.load_source(source) for source in sources]

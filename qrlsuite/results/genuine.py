@@ -29,8 +29,8 @@ def require_no_link(*paths: Path) -> None:
     for path in paths:
         if path.is_symlink():
             raise StoreError(
-                f"{path} is a link: links below a results folder are not followed, for what they lead to would count "
-                "twice; move the folder or file itself there"
+                f"{path} is a link: links in a results folder are not followed, because their targets would "
+                "count twice; move the folder or file itself there"
             )
 
 

@@ -70,10 +70,10 @@ def refusal(store: EntryStore, probe: ProbeRecord) -> DependentSeedsError:
     plugin = f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None else ""
     return DependentSeedsError(
         f"seed {probe.seed} depends on its company: trained again in a fresh process, it differs in "
-        f"{probe.difference}. So no seed is what it says, and boards leave the entry out. Likely "
-        "causes: something that all agents of a process share (a global variable, a class attribute, a closure, a "
-        "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
-        "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "
-        f"{kind.kind}:{name}{plugin}` looks for them, and for those of an environment or algorithm likewise. What was "
-        f"trained is kept in {store.path}; correct the code, and repeat the command"
+        f"{probe.difference}. So its seeds are not independent, and boards leave the entry out. Likely "
+        "causes: something that all agents of a process share (a global variable, a class attribute, a "
+        "closure, a cache), a global random generator, the time, or functions that torch rounds by the "
+        "place in a stack (sigmoid, silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "
+        f"{kind.kind}:{name}{plugin}` looks for them (and likewise for an environment or algorithm). "
+        f"Trained seeds are kept in {store.path}; fix the code and rerun the command"
     )

@@ -1,6 +1,6 @@
 """Records as types: who writes one builds it, who reads one gets it, and one that is damaged is refused here.
 
-    entry.json     EntryRecord: what was run; of a published entry with `published`
+    entry.json     EntryRecord: the entry; of a published entry with `published`
     run.json       RunRecord: one seed's run
     epochs.jsonl   EpochLine: one epoch of a seed; epochs.parquet has the same in columns
     timings.jsonl  TimingLine: how long that epoch took
@@ -247,7 +247,7 @@ class ProbeRecord(Record):
 
 
 class AgentsRecord(Record):
-    """The agents of a published entry: whose they are, the SHA-256 of their file, and with what they were made."""
+    """The agents of a published entry: whose they are, the SHA-256 of their file, and their provenance."""
 
     sha256: str
     seeds: Annotated[list[Count], Field(min_length=1), AfterValidator(_sorted_once)]
@@ -464,7 +464,7 @@ class RunRecord(CodedRecord):
         return {name: self.content[name] for name in ("code", "probe") if name in self.content}
 
     def told(self, folder: Path, **more: Any) -> dict[str, Any]:
-        """Return what trackers are told: all but the version, and the seed's folder."""
+        """Return the record for trackers: all but the version, and the seed's folder."""
         content = {name: value for name, value in self.content.items() if name != "format_version"}
         return {**content, "folder": str(folder), **more}
 
@@ -472,7 +472,7 @@ class RunRecord(CodedRecord):
 class EpochLine(Record):
     """One epoch of a seed. Further keys are metrics of training, and `measured.NAME` of the environment.
 
-    `scores` are those of the validation's episodes, or `score` their mean if nothing more was imported. `executions` of
+    `scores` belong to the validation's episodes, or `score` their mean if nothing more was imported. `executions` of
     circuits are counted by name. `diverged`: numbers of the agent were not finite after it. Tables have `measured`.
     """
 

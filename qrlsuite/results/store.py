@@ -90,7 +90,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 def cause(error: OSError) -> str:
     """Return why a file could not be written and, on a full disk, a command that frees space."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    hint = " (to free some: qrlsuite runs gc --runs DIR, and DIR/tuning of searches)"
+    hint = " (to free some: qrlsuite runs gc --runs DIR; for searches, --runs DIR/tuning)"
     return f"{error.strerror or error}{hint * full}"
 
 
@@ -674,7 +674,7 @@ class EntryStore:
         Parameters
         ----------
         mark:
-            Mark of another code than that of the folder without a mark.
+            Mark of another code than the code of the folder without a mark.
         """
         store = cls(runs / entry.task.name / f"{entry.name}{mark}")
         genuine.require_no_link(store.path.parent, store.path)

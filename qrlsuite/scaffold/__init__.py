@@ -94,7 +94,7 @@ def package(path: str | os.PathLike[str], name: str | None = None) -> Package:
         inner = "parts" if source.name == module else module
         if f"src/{module}/{inner}.py" in files:
             raise ScaffoldError(
-                f"{source.path} has a file parts.py, in whose place its __init__.py would be: rename it"
+                f"{source.path} has a file parts.py, but that name is needed for its __init__.py: rename it"
             )
         files[first] = _registration(registered, module, inner).encode()
         files[f"src/{module}/{inner}.py"] = _with_targets(text, tree, registered).encode()

@@ -233,7 +233,7 @@ def _ratio(
 def rliable_arrays(scores: Scores) -> dict[str, FloatArray]:
     """Return {entry: (runs, tasks)} as rliable takes it; of each task the first n runs, n the fewest of the entry.
 
-    rliable takes more to be better: give it 1 minus these, if its aggregates are to point that way.
+    In rliable larger is better: give it 1 minus these values.
     """
     arrays = {}
     for name, values in scores.items():

@@ -31,7 +31,7 @@ class Board:
         Shape (M, M, E, D): cells without a significant difference in which both intervals end at the horizon: too few
         steps to tell.
     decided:
-        Shape (M, M): whether both have at least 20 runs, and all that were asked for.
+        Shape (M, M): whether both have at least 20 runs, and all requested ones.
     not_reached:
         Shape (M,): whether S_hat is the horizon in every cell.
     evidence:

@@ -132,7 +132,7 @@ def overall(wins: int, losses: int, neither_reached: bool = False) -> Outcome:
     Parameters
     ----------
     neither_reached:
-        Whether both entries reached the goal of no cell: that is then said in place of "no difference".
+        Whether both entries reached the goal of no cell: the outcome is then `NOT_REACHED` in place of "no difference".
     """
     if wins and losses:
         return Outcome.TRADE_OFF
@@ -199,7 +199,7 @@ def compare(
     resampling:
         None means 1000 resamples from seed 0.
     horizon:
-        Environment steps beyond which neither entry is looked at; None means the shorter horizon.
+        Environment steps after which scores do not count; None means the shorter horizon.
 
     Raises
     ------

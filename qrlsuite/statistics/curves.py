@@ -84,7 +84,7 @@ class LearningCurves:
     name:
         Name of the entry in sentences and rankings.
     complete:
-        Whether all runs that were asked for are among them: a board ranks no others.
+        Whether it has all requested runs: a board ranks only complete entries.
 
     Raises
     ------

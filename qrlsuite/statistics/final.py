@@ -44,7 +44,7 @@ def areas(entry: LearningCurves) -> FloatArray:
 
 
 def deviations(entry: LearningCurves, grid: Grid) -> FloatArray:
-    """Return, shape (N,): how far each run's mean steps below the thresholds are from those of the median run.
+    """Return, shape (N,): how far each run's mean steps below the thresholds are from the median run's.
 
     Their means are compared by the test of Brown and Forsythe (1974), labels of runs permuted: docs/error-rates.md.
     """

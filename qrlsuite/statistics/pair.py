@@ -1,6 +1,6 @@
 """One pair by its times below threshold: the verdict of the pair, and every threshold with an interval of its own.
 
-The verdict is that of a board of these two (`times_board`): rule `steps` at level alpha, from 4 runs on.
+The verdict is the one on a board of these two (`times_board`): rule `steps` at level alpha, from 4 runs on.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from qrlsuite.statistics.times import check_probability, student_quantile, times
 from qrlsuite.statistics.times_board import Direction, log_ratios, named_direction, spread
 
 POWER = 0.8
-"""With which a pair's runs would have shown `TimesPair.detectable`."""
+"""The power with which a pair's runs would have shown `TimesPair.detectable`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,7 +94,7 @@ def times_pair(
     alpha:
         In (0, 1).
     horizon:
-        Environment steps beyond which neither entry is looked at; None means the shorter horizon.
+        Environment steps after which scores do not count; None means the shorter horizon.
     seconds:
         After which relabeling stops, even if the verdict may still turn.
 

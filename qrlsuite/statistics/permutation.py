@@ -61,7 +61,7 @@ def relabelings_for(level: float) -> int:
     needed = 20 / check_probability(level, "level")
     if needed > MOST:
         raise OptionError(
-            f"a level of {level:.2g} for each test takes {needed:.2g} relabelings, more than {MOST:,}: "
+            f"a level of {level:.2g} for each test takes {needed:.2g} permutations, more than {MOST:,}: "
             "choose a larger alpha, or fewer entries"
         )
     return CHUNK * max(1, math.ceil(needed / CHUNK))
@@ -128,12 +128,12 @@ class MaxT:
         Runs of both entries per block, in the order of the rows, the same for all pairs: labels are exchanged
         within a block only. None means a single block. Relabelings of a block do not depend on later blocks.
     ratio:
-        Whether t is that of the log ratio of two means of positive numbers, see `ratio_t`, and not of their difference.
+        Whether t tests the log ratio of two means of positive numbers, see `ratio_t`, and not of their difference.
 
     Attributes
     ----------
     t:
-        Shape (P, E): Welch's t or that of the log ratio, positive where the first has the smaller mean; infinite where
+        Shape (P, E): Welch's t or the t of the log ratio, positive where the first has the smaller mean; infinite where
         neither entry varies and they differ, 0 where nothing differs.
     reached:
         Shape (P, E): relabelings whose max |t| is at least |t| here.

@@ -139,7 +139,7 @@ def chances(
     """Return how often an entry that needs fewer steps than all others has been told apart from them, by each look.
 
     Log mean steps are drawn as normal numbers, as they nearly are for many runs: the relabeling test of rule `steps`
-    and the tests of equality are then those of a normal mean.
+    and the tests of equality are then tests of a normal mean.
 
     Parameters
     ----------

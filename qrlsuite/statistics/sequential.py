@@ -1,11 +1,10 @@
-"""Sequential designs: several looks at growing numbers of runs, with one error probability for all looks.
-
-Whoever looks at the data again and again and stops at the first p below .05 errs far more often than that. Here
-alpha is spent over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70), and over
-the pairs by a group-sequential Holm procedure (Maurer and Bretz 2013, Statistics in Biopharmaceutical Research 5;
-Ye, Li, Liu and Yao 2013, Statistics in Medicine 32): every pair that is not yet decided is tested at the levels that
-belong to alpha / number of such pairs, and after a rejection again with one less. The family is all pairs that were
-planned. A pair that is closed as equal is not rejected: it keeps its share of alpha.
+"""Sequential designs: several looks at growing numbers of runs, with one error probability for all looks. Someone who
+looks at the data again and again and stops at the first p below .05 errs far more often than that. Here alpha is spent
+over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70), and over the pairs by a
+group-sequential Holm procedure (Maurer and Bretz 2013, Statistics in Biopharmaceutical Research 5; Ye, Li, Liu and Yao
+2013, Statistics in Medicine 32): every pair that is not yet decided is tested at the levels that belong to alpha /
+number of such pairs, and after a rejection again with one less. The family is all pairs that were planned. A pair that
+is closed as equal is not rejected: it keeps its share of alpha.
 
 The test is the test of rule `steps` or `times` (`MaxT`); labels are exchanged within the block of seeds that each look
 added. By `steps`, relabelings of a look go on until no decision can turn.
@@ -207,7 +206,7 @@ class Claim:
 
     @property
     def shares(self) -> int:
-        """How many tests share its alpha: those of which a single one is enough."""
+        """How many tests share its alpha, if a single one is enough."""
         return 1 if self.at_most is None else len(self.rivals)
 
 
@@ -399,7 +398,7 @@ class PairDecision:
 
     @property
     def shown(self) -> tuple[float, float, float]:
-        """Difference and interval of what decided: of the mean, or of the threshold where `at_threshold`."""
+        """Difference and interval that decided: of the mean, or of the threshold where `at_threshold`."""
         if self.at_threshold:
             return self.leading_difference, *self.leading_interval
         return self.difference, *self.interval
@@ -462,7 +461,7 @@ class ClaimDecision:
 
     @property
     def verdict(self) -> str:
-        """What is known of the claim, in words."""
+        """The state of the claim, in words."""
         if not self.n_runs:
             return "open"
         if self.established is not None:
@@ -513,7 +512,7 @@ def decide(
     runs:
         For each entry of the design its runs so far, in the order of their seeds; entries without any may be
         absent. A look takes place once every entry with an open pair or claim has the runs for it. Runs beyond a look
-        count for later ones only; runs that come after all of an entry's are closed are not looked at.
+        count for later ones only; runs that an entry got after all of its pairs were closed do not count.
     grid:
         Its E thresholds count; its deltas do not.
     known:
@@ -644,8 +643,8 @@ def next_claim(
 ) -> ClaimDecision:
     """Return an open claim after look 0, 1, ...; arguments as for `next_look`, of one study.
 
-    As many runs of both make the law of t symmetric among relabelings: p of one side is half of that of two. For "at
-    most 10 percent more" the entry's numbers are multiplied by 1.1. Keys of `known` end with `at_most`.
+    As many runs of both make the law of t symmetric among relabelings: p of one side is half of p of both sides. For
+    "at most 10 percent more" the entry's numbers are multiplied by 1.1. Keys of `known` end with `at_most`.
     """
     claim, n_runs = before.claim, design.looks[look]
     factor = Fraction(1 + (claim.at_most or 0)).limit_denominator(1000)

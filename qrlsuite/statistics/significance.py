@@ -142,7 +142,7 @@ class SignificanceRule(Protocol):
 
     >>> class HalfRule:
     ...     name = "half"
-    ...     promise = "none: whoever needs less than half is declared the winner"
+    ...     promise = "none: an entry that needs less than half is the winner"
     ...
     ...     def __call__(self, first, second):
     ...         fewer, more = 2 * first.point < second.point, 2 * second.point < first.point

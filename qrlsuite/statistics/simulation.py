@@ -81,7 +81,7 @@ class SmoothedRuns:
 
 
 def slower(entry: LearningCurves, factor: float) -> LearningCurves:
-    """Return runs that take `factor` >= 1 times as long to get as far: an entry known to be worse, for `power`.
+    """Return runs that take `factor` >= 1 times as long to reach each score: an entry known to be worse, for `power`.
 
     A run's value after epoch t is the original's after epoch t / factor, between epochs interpolated linearly,
     before the first the first.
@@ -150,7 +150,7 @@ class DecisionRates:
     within_margin:
         For each pair: fraction of studies that found the difference within the margin, of either verdict.
     mean_runs:
-        For each pair: mean number of runs of each of its entries when it was closed.
+        For each pair: mean number of runs per entry when it was closed.
     any_difference:
         Fraction of studies in which any pair was found to differ: the error between equals.
     """

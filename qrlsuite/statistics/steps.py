@@ -1,6 +1,6 @@
 """Rule `steps` at work: relabelings until no decision can turn, intervals that belong to p, and the limits of few runs.
 
-One number per run decides: its steps below threshold, meant over the thresholds, with half an epoch added, so that a
+One number per run decides: its steps below threshold, averaged over the thresholds, with half an epoch added, so that a
 ratio exists where a mean is 0. docs/error-rates.md has how this test was chosen, and where it errs.
 """
 
@@ -113,7 +113,7 @@ def _sums(
 ) -> FloatArray:
     """Return, (2, labelings), sums of runs over their mean, and of their squares, over those labeled "first".
 
-    The runs are those of a pair's first (0) or second (1) entry. The labelings are all, or so many chunks.
+    The runs belong to a pair's first (0) or second (1) entry. The labelings are all, or so many chunks.
     """
     side = np.array(runs) / np.mean(runs)
     powers, part = np.stack([side, side**2]), slice(n_first, None) if place else slice(n_first)

@@ -121,7 +121,7 @@ def times_board(
 ) -> TimesBoard:
     """Compare all pairs of M entries by their mean time below threshold.
 
-    Entries with fewer than 20 runs stand apart, and so do incomplete ones: no pair with them is tested or counted.
+    Entries with fewer than 20 runs stand apart, like incomplete ones: no pair with them is tested or counted.
     Numbers of runs may differ. Relabelings go on until no decision can turn.
 
     Parameters

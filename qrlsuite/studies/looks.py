@@ -143,13 +143,13 @@ class Study:
         protocol = max(entry.task.file.protocol.seeds for entry in self.entries.values())
         if block.start < protocol:
             raise OptionError(
-                f"{self.source}: first_seed = {block.start}: seeds 0:{protocol} are the protocol's, which may have "
-                f"been looked at; begin at {protocol} or later"
+                f"{self.source}: first_seed = {block.start}: seeds 0:{protocol} are the protocol's, and "
+                f"somebody may have seen them; begin at {protocol} or later"
             )
         if block.stop > TUNING_SEEDS:
             raise OptionError(
-                f"{self.source}: first_seed = {block.start}: seeds from {TUNING_SEEDS} up are those of tuning; the "
-                f"block has to end below"
+                f"{self.source}: first_seed = {block.start}: seeds from {TUNING_SEEDS} up are for tuning; "
+                "the block has to end below"
             )
 
     @property
@@ -202,7 +202,10 @@ class Study:
                 block = blocks.get(plan, own)
                 common = range(max(block.start, own.start), min(block.stop, own.stop))
                 if common and (shared or log.parent == self.folder):
-                    yield f"study {plan} has seen these seeds ({log}), and what they showed may have chosen this one"
+                    yield (
+                        f"study {plan} has seen these seeds ({log}), and their results may have shaped "
+                        "this study"
+                    )
 
     def _next_block(self) -> int:
         return self.looks.first_seed + max(1000, len(self.looks.block))
@@ -229,8 +232,9 @@ class Study:
             store = EntryStore.find(self.folder, entry)
             if not store.seeds() and _has_other_code(table, entry):
                 raise OptionError(
-                    f"{self.source}: the code of '{name}' is not what it was when the study was written, and its hash "
-                    "covers it: restore that code, or write another study with `qrlsuite study new`"
+                    f"{self.source}: the code of '{name}' has changed since the study was written, and the "
+                    "study's hash covers it: restore that code, or write another study with `qrlsuite "
+                    "study new`"
                 )
 
     def end(self) -> None:
@@ -241,7 +245,7 @@ class Study:
         if state.ended is not None:
             raise OptionError(f"{self.source}: the study was ended on {state.ended} already")
         if state.decision.finished:
-            raise OptionError(f"{self.source}: all is decided, so there is nothing to end")
+            raise OptionError(f"{self.source}: everything is decided, so there is nothing to end")
         append(self.folder / LOG, json_line({"ended": _now()}))
 
     def read(self) -> State:
@@ -469,8 +473,8 @@ def _fixed(file: StudyFile) -> tuple[StudyFile, list[Member]]:
     for index, (table, entry) in enumerate((member.table, member.entry) for member in members):
         if table.hash not in (None, entry.hash):
             raise OptionError(
-                f"{source}: entries.{index}.hash is '{table.hash}', these options make '{entry.hash}' here: it is "
-                "another entry than was fixed; write a new study with `qrlsuite study new`"
+                f"{source}: entries.{index}.hash is '{table.hash}', these options make '{entry.hash}' here: "
+                "the options have changed; write a new study with `qrlsuite study new`"
             )
         for before, other in enumerate(members[:index]):
             if other.entry.hash == entry.hash:

@@ -125,8 +125,8 @@ class Overview(Shown):
             yield Text(f"left: {_left(lacking, self.workers)}")
         if self.pairs[1]:
             yield Text(
-                f"{self.pairs[0]} of {counted(self.pairs[1], 'pair')} decided: of entries with 20 seeds or more, by "
-                "mean time below threshold at an error of 5%"
+                f"{self.pairs[0]} of {counted(self.pairs[1], 'pair')} decided: of entries with 20 seeds or "
+                "more, by steps below threshold at an error of 5%"
             )
         if file.core_hours is not None:
             yield Text(

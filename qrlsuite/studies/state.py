@@ -118,7 +118,7 @@ class State(Shown):
 
     @property
     def claims(self) -> list[str]:
-        """A sentence for each claim: what is claimed, and whether it is established."""
+        """A sentence for each claim, with its state: established or not."""
         return [f"claim: {each.claim.sentence}: {each.verdict}" for each in self.decision.claims]
 
     def labeled(self, words: Sequence[str]) -> State:
@@ -439,18 +439,18 @@ def reason_note(study: Study) -> str:
     if study.design.looks[0] >= 20:
         return ""
     return (
-        "NOTE: it looks below 20 seeds, where rare failures that have not occurred yet decide too much. Reason "
+        "NOTE: its first look comes before 20 seeds, when rare failures may not have occurred yet. Reason "
         f"given: {study.looks.reason}"
     )
 
 
 TURNED = {
-    "fff5ccb281a6155b": "10 qubits / sines 14 rests on the 10,000 relabelings of its look at 20 seeds (p .0069 at "
-    "level .0075). 10 million give .0083, above that level.",
-    "fd4f9be21ac4ae3a": "circuit / sines was left open by the 10,000 relabelings of its look at 40 seeds (p .0084 at "
-    "level .0067). 10 million give .0060, below that level.",
+    "fff5ccb281a6155b": "10 qubits / sines 14 rests on the 10,000 permutations of its look at 20 seeds (p "
+    ".0069 at level .0075). 10 million give .0083, above that level.",
+    "fd4f9be21ac4ae3a": "circuit / sines was left open by the 10,000 permutations of its look at 40 seeds "
+    "(p .0084 at level .0067). 10 million give .0060, below that level.",
 }
-"""By hash of a published study: a decision that more relabelings turn. It stands, since their number was fixed."""
+"""By hash of a published study: a decision that more permutations turn. It stands, since their number was fixed."""
 
 
 def horizon_note(outcome: State) -> str:
@@ -458,9 +458,9 @@ def horizon_note(outcome: State) -> str:
     if not any(map(outcome.late, outcome.pairs)):
         return ""
     return (
-        f"at the horizon: both entries are {outcome.study.grid.before} the thresholds for {NEAR:.0%} or more of the "
-        "steps. That they are equal, or not told apart, says little there: neither had the time to learn. A study with "
-        "more epochs may tell"
+        f"at the horizon: both entries are {outcome.study.grid.before} the thresholds for {NEAR:.0%} or "
+        "more of the steps. Such a verdict means little: neither had time to learn. A study with more "
+        "epochs may decide"
     )
 
 
@@ -468,7 +468,7 @@ def lost_note(outcome: State) -> str:
     """Say which seeds were asked for and are not there, and that the log is gone; empty where all is there."""
     notes = [f"incomplete: {told} ({name})" for name, told in outcome.lost.items()]
     if outcome.begun and outcome.begun_at is None:
-        notes.append("its log is gone: nobody can see when it began, or who has seen its seeds before")
+        notes.append("its log is missing: nobody can see when it began, or who has seen its seeds before")
     return "; ".join(notes)
 
 

@@ -182,7 +182,8 @@ class StudiesTogether(Shown):
         )
         if len(self.studies) >= DRAWN:
             yield Text(
-                "over such tasks: if these tasks were drawn at random from many, what follows for the many."
+                "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at "
+                "random."
             )
         alpha = max(each.study.looks.alpha for each in self.studies)
         for claim, tasks in self.claims.items():

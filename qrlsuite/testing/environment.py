@@ -41,7 +41,7 @@ def check(subject: Subject) -> list[Finding]:
         return rules.findings
     length: list[int] = []
     if not rules.run(
-        "episodes end", f"within {LONGEST} steps, and begin anew", lambda: length.append(_end(lanes))
+        "episodes end", f"within {LONGEST} steps, and start over", lambda: length.append(_end(lanes))
     ):
         return rules.findings
     steps = min(length[0] + 5, 300)

@@ -86,7 +86,7 @@ def state(lanes: Lanes, steps: int) -> None:
 
 
 def validation(lanes: Lanes) -> None:
-    """Lanes play the same first episodes whether or not they are reset, and whoever is beside them."""
+    """Lanes play the same first episodes whether or not they are reset, and with any lanes beside them."""
     space = lanes.make([0]).single_action_space
     action_rows = actions(range(S), space, LONGEST)
     envs = lanes.make(range(S), autoreset=False, shared=True)

@@ -109,7 +109,7 @@ class Cost:
         shots = (
             "" if self.shots is None else f", {self.shots} shots each: {self.shots * self.circuits:,} shots"
         )
-        kept = f" ({self.kept} of them are kept from before)" if self.kept else ""
+        kept = f" ({self.kept} of them are finished already)" if self.kept else ""
         terms = f"; {self.terms}" if self.terms else ""
         played = f"{self.agents} agents, {self.episodes} episodes each{kept}"
         return f"{played}: about {self.circuits:,} circuits{shots}{terms}"
@@ -198,8 +198,8 @@ class Deployment:
             except Exception as error:  # whatever a device's package raises
                 reason = " ".join(str(error).split()) or type(error).__name__
                 raise QrlSuiteError(
-                    f"{self.name}: stopped after {progress[0]} episodes of each agent: {reason}; these are kept, and "
-                    "the same command plays the rest"
+                    f"{self.name}: stopped after {progress[0]} episodes of each agent: {reason}; they are "
+                    "kept, and the same command plays the rest"
                 ) from error
 
         return act

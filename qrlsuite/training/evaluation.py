@@ -211,7 +211,7 @@ def trained_entry(store: EntryStore, on: Task | None = None) -> Entry:
         if trained_on != played:
             raise OptionError(
                 f"--task {on.name}: '{entry.label}' was trained on '{entry.task.name}', whose {what}s are "
-                f"{_short(trained_on)}, and here they are {_short(played)}: agents play where both are equal"
+                f"{_short(trained_on)}, but here {_short(played)}: agents play only where both are equal"
             )
     if envs[0].inner.running_statistics != envs[1].inner.running_statistics:
         raise OptionError(

@@ -79,7 +79,7 @@ def timing_of(epoch: Epoch, seeds: int) -> TimingLine:
 
 
 class GroupFiles:
-    """The files of a group of seeds of an entry while it is trained.
+    """The files of a group of an entry's seeds while it is trained.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class MeteredEnv(LaneEnv):
                 self.observe(observations)
         except InvalidAction as error:
             raise PluginError(
-                f"environment '{self.environment_name}' was given what is no action of it: {error}"
+                f"environment '{self.environment_name}' got an action outside its action space: {error}"
             ) from error
         except PluginError:
             raise

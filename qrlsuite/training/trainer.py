@@ -102,8 +102,8 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
             f"; if it does take them, write actions={(*entry.algorithm.actions, kind)} in its AlgorithmSpec"
         )
     raise OptionError(
-        f"algorithm '{entry.algorithm.name}' takes {' and '.join(entry.algorithm.actions)} actions, and those of "
-        f"task '{entry.task.name}' are {space}: {advice}"
+        f"algorithm '{entry.algorithm.name}' takes {' and '.join(entry.algorithm.actions)} actions, and "
+        f"task '{entry.task.name}' has {space}: {advice}"
     )
 
 

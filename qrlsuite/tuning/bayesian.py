@@ -356,7 +356,7 @@ class Bayesian(Search):
 
     @property
     def _regret_among(self) -> surrogate.Regret:
-        """The regret of the chosen settings among those of the last round."""
+        """The regret of the chosen settings among the settings of the last round."""
         return surrogate.regret_among(
             np.array([max(trial.merit.signal, 1.0) for trial in self.last]),
             np.array([trial.spread for trial in self.last]),

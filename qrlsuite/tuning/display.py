@@ -63,9 +63,7 @@ class TuneDisplay:
             self.console.print("\n".join(lines), markup=False)
         cores, known = self.where.workers, [cost for cost in costs if cost is not None]
         if len(known) < len(costs):
-            self.console.print(
-                "what it takes will be known after the first trial; finished trials cost nothing again"
-            )
+            self.console.print("the cost is known after the first trial; finished trials cost nothing again")
         else:
             low, high = map(sum, zip(*known))
             self.console.print(

@@ -63,7 +63,7 @@ def points(name: str, space: Space, trials: int | None, seed: int) -> list[Point
     ranges = [dimension.name for dimension in space if dimension.range is not None]
     if ranges:
         raise OptionError(
-            f"{ranges[0]} is a range, which sampler 'grid' cannot go through: give a list, or use --sampler random"
+            f"{ranges[0]} is a range, and sampler 'grid' needs a list: give a list, or use --sampler random"
         )
     if trials is not None and trials < size(space):
         raise OptionError(

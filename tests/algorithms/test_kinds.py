@@ -186,7 +186,8 @@ def test_a_model_that_forgets_its_state_and_actions_out_of_range(tmp_path: Path)
     trainer = Trainer(entry(tmp_path, "pendulum", "td3 mlp width=5"), [0])
     trainer.start()
     with pytest.raises(
-        PluginError, match=r"given what is no action of it: actions must lie in -2\.\.2, not 3: .*from_units"
+        PluginError,
+        match=r"got an action outside its action space: actions must lie in -2\.\.2, not 3: .*from_units",
     ):
         trainer.envs.step(np.full((2, 1), 3, np.float32))
 

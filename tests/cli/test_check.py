@@ -170,7 +170,7 @@ def test_a_distribution_stands_for_all_that_it_registers(check: Command) -> None
     )
     code, _, err = check("tidy", "slots=3")
     assert code == 2
-    assert "options are for one thing" in err
+    assert "options need a single name" in err
 
 
 def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check: Command) -> None:
@@ -212,7 +212,7 @@ def test_what_the_messages_tell_to_type_works(check: Command) -> None:
 def test_without_a_name_it_says_what_can_be_checked(check: Command) -> None:
     code, out, _ = check()
     assert code == 0
-    assert "Installed plugins of others: failing, first, local" in out
+    assert "Other installed plugins: failing, first, local" in out
     assert json.loads(check("--json")[1])["distributions"] == sorted(DISTRIBUTIONS)
 
 

@@ -68,7 +68,7 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
         assert done.returncode == 0, done.stderr
         assert "4 seeds complete" in done.stderr
         assert f"results: {runs}/" in done.stderr
-        assert (f"results go to the new folder {runs};" in done.stderr) == (width == "16")
+        assert (f"results are in the new folder {runs};" in done.stderr) == (width == "16")
     words = ("run", "ddqn", "mlp", "width=16", "--task", task, "--runs", runs)
     assert json.loads(qrlsuite(*words, "--json").stdout)["seeds"] == 4
     assert "next: qrlsuite leaderboard --task tiny" in done.stderr
@@ -276,13 +276,13 @@ run vqc-native qubits=21 --task beam6g => qubits = 21
 run vqc-native qubits=1 --task beam6g => needs 2 to 20
 run vqc-native gate=rott --task beam6g => gate = 'rott'
 run vqc-native ansatz=ipq --task beam6g => unknown ansatz 'ipq'; did you mean 'iqp'
-run 'ddqn mlp' --task pendulum => 'ddqn' takes discrete actions, and those of task 'pendulum' are Box(-2.0
-run 'td3 mlp' --task cartpole => 'td3' takes box actions, and those of task 'cartpole' are Discrete(2): take one of
+run 'ddqn mlp' --task pendulum => 'ddqn' takes discrete actions, and task 'pendulum' has Box(-2.0
+run 'td3 mlp' --task cartpole => 'td3' takes box actions, and task 'cartpole' has Discrete(2): take one of
 run mlp --task gym:tests.environments.strangers:Unbounded-v0 => has no bounds: state finite ones, gymnasium.spaces.Box
 run 'ddqn gru' --task cartpole => model 'gru' remembers what it saw in an episode, and algorithm 'ddqn' would make it
 run 'ddqn cnn' --task cartpole => model 'cnn' needs images, a Box of (height, width)
 run vqc-native qubits=4 linear=false --task pendulum => the circuit has 4 inputs and 4 expectation values, the actor 3
-study run mixed.toml => 'ddqn' takes discrete actions, and those of task 'pendulum' are Box(-2.0
+study run mixed.toml => 'ddqn' takes discrete actions, and task 'pendulum' has Box(-2.0
 list modles => did you mean 'models'
 show mpl => did you mean 'mlp'
 show mlp width=4 => model 'mlp': NAME=VALUE, --out and --format draw an ansatz
@@ -312,7 +312,7 @@ runs gc --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
 verify --rerun '2 choise=3' => --rerun 2 choise=3: write a number of seeds
 verify --rerun '2 choice=x' => choice is a whole number, which an earlier check printed
 export => name the entries to export, or say `export all`
-plot curves => `qrlsuite leaderboard --published` shows what comes with the suite
+plot curves => `qrlsuite leaderboard --published` shows the entries that come with the suite
 plot curves --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
 plot curvs => unknown picture 'curvs'; did you mean 'curves'
 plot trajectory => did you mean 'trajectories'
@@ -343,7 +343,7 @@ plot barz --study fig6 => study 'fig6' has no picture 'barz'; did you mean 'bars
 plot bars --study fig6 --entry mlp => --study fig6 names the entries
 plot bars --study fig6 --study fig7 => picture 'bars' shows one study: leave fig7 out
 plot histogram --study fig8 => drawn by: qrlsuite evaluate 'ddqn mlp width=64' 'ddqn vqc-native qubits=14' --task beam6g
-plot deployed --study fig6 => drawn where a study's file says what is evaluated
+plot deployed --study fig6 => needs a study whose file has an evaluation
 plot shots --study deploy --seeds 3 => plays the best agents of all seeds: leave --seeds
 plot bars --study fig6 --task cartpole --runs . => study 'fig6' has no entry of task cartpole
 plot entries --study memory --study quantum-or-not => picture 'entries' shows one study
@@ -360,12 +360,12 @@ study new p.toml --task tiny.toml mlp 'mlp width=4' --looks 10,20 => the first i
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20;40' => --looks 20;40: write numbers of seeds
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20,40 margin=0' => margin = 0.0 is not a positive number
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=3 => seeds 0:4 are the protocol's
-study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=999999 => from 1000000 up are those of tuning
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=999999 => from 1000000 up are for tuning
 study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20 margn=1' => option 'margn'; did you mean 'margin'
 study new p --task tiny.toml mlp 'mlp width=4' => p: a study file's name ends in .toml
 study new 'p q.toml' --task tiny.toml mlp 'mlp width=4' => name
 study new tiny.toml --task tiny.toml mlp 'mlp width=4' => tiny.toml is there already
-new plugin acme-ring => name the file that it is made of: --from ring.py
+new plugin acme-ring => name the plugin's file: --from ring.py
 new plugin --from part.py => part.py imports ring.py: make a package's folder of both
 new plugin --from none.py => there is no plugin none.py
 new plugin --from ring.py Ring => 'Ring' cannot be the name of a package

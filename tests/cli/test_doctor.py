@@ -76,7 +76,7 @@ def test_what_is_broken_is_said_with_what_to_type(tmp_path: Path) -> None:
     ]
     expected = (
         "no-such-package is not installed: pip install 'no-such-package>=1'",
-        "is installed, and does not fit: pip install 'numpy<1'",
+        "is installed, but does not fit: pip install 'numpy<1'",
         r"GPU: ImportError: libtorch.so: \x1b[31mno such file",
         "runs cannot be written and locked: Not a directory; use --runs DIR",
     )

@@ -475,7 +475,7 @@ def test_seeds_that_a_study_lost_are_named() -> None:
     read = studies.read_outcome("widths.toml", Path("runs"))
     assert looks_report.view(read)["note"].startswith(f"incomplete: {said}")
     (folder / "looks.jsonl").unlink()
-    assert "its log is gone" in say("show", "widths.toml").stdout
+    assert "its log is missing" in say("show", "widths.toml").stdout
 
 
 def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:
@@ -659,7 +659,7 @@ def test_pictures_have_a_row_for_each_pair_and_each_entry(refused: Refused) -> N
     figure = drawing.draw(replace(outcome, decision=decision))
     [axes] = figure.axes
     assert next(list(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2) == [0.1, 10]
-    assert {text.get_text() for text in axes.texts} == {"20", "both mean times are 0"}
+    assert {text.get_text() for text in axes.texts} == {"20", "both entries spend no step below a threshold"}
     assert "cut at a factor of 10" in " ".join(figure.get_supxlabel().split())
 
     [axes] = drawing.draw_entries(outcome).axes
@@ -724,7 +724,7 @@ def test_a_damaged_published_study_is_refused(exported: Path, refused: Refused) 
     edit(str(exported / "plan.toml"), "alpha = 0.05", "alpha = 0.5")
     assert "was not trained by study" in refused("show", str(exported))
     assert "holds another study" in refused("export", "p.toml", "--out", "plans")
-    assert "by commands of their own" in refused("export", "p.toml", "mlp width=16")
+    assert "with separate commands" in refused("export", "p.toml", "mlp width=16")
 
 
 def test_a_published_study_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -775,7 +775,7 @@ def test_verdicts_of_entries_that_hardly_leave_the_horizon_say_so() -> None:
     assert [line["verdict"].endswith(", at the horizon") for line in page["pairs"]] == [
         pair["at_horizon"] for pair in pairs.values()
     ]
-    assert "neither had the time to learn" in page["note"]
+    assert "neither had time to learn" in page["note"]
 
 
 def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:

@@ -132,8 +132,8 @@ def test_an_agent_acts_in_a_loop_of_ones_own(kept: Train, tmp_path: Path) -> Non
     ):
         agent.act(np.zeros((2, 5)))
     for seen, message in (
-        (np.full((1, 3), np.nan), "observations are not finite"),
-        (np.full((1, 3), 1e300), "observations are not finite"),
+        (np.full((1, 3), np.nan), "observations must be finite"),
+        (np.full((1, 3), 1e300), "observations must be finite"),
         ({"seen": 1}, "of type dict are no array of real numbers"),
         (["a"], "of type list are no array of real numbers"),
         ([[1, 2, 3], [1]], "of type list are no array of real numbers"),
@@ -179,7 +179,7 @@ def test_an_agent_of_a_task_with_masks_is_told_what_can_be_chosen(tmp_path: Path
         {"action_mask": mask[0]},
         {"action_mask": mask[:, :1]},
     ):
-        with pytest.raises(OptionError, match=r"task 'taxi' says what can be chosen: give act\(\) the infos"):
+        with pytest.raises(OptionError, match=r"task 'taxi' has action masks: give act\(\) the infos"):
             agent.act(observations, infos=missing)
 
 
@@ -254,7 +254,7 @@ def test_wrong_input(kept: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         (["mlp", "--out", "x.txt"], r"the file's ending must be \.gif or \.mp4"),
         (["mlp", "--out", "x.mp4"], r"ffmpeg, which is not installed: write a \.gif"),
         (["mpl"], "no entry 'mpl'"),
-        (["tiny/mlp", "--task", "cartpole"], "agents play where both are equal"),
+        (["tiny/mlp", "--task", "cartpole"], "agents play only where both are equal"),
     ):
         with pytest.raises(QrlSuiteError, match=message):
             say("play", *words, "--runs", str(tmp_path / "runs"))

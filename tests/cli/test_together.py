@@ -113,7 +113,7 @@ def test_the_mean_of_many_tasks_is_that_of_tasks_like_them(monkeypatch: pytest.M
     assert any(pair.drawn_verdict != pair.verdict for pair in read.pairs), (
         "one of the tasks, the other of their like"
     )
-    assert "what follows for the many" in " ".join(repr(read).split())
+    assert "the conclusion for all tasks" in " ".join(repr(read).split())
     assert read.as_dict()["pairs"][0]["drawn_interval"] == list(read.pairs[0].ratio.drawn_interval)
 
 

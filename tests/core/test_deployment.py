@@ -25,7 +25,7 @@ CIRCUIT = ("qubits=2", "layers=1")
 
 
 class Unreliable(qml.devices.DefaultQubit):  # type: ignore[misc, unused-ignore]
-    """A device that is no simulator by its name, and hangs up after some batches of circuits."""
+    """A device that is not a simulator by its name, and hangs up after some batches of circuits."""
 
     batches = 0
 
@@ -112,7 +112,7 @@ def test_a_device_that_refuses_half_way_loses_one_round(
         return Deployment(trained, "pennylane", device, best=1).play(8, 0)
 
     unreliable.batches = 32  # a round takes 20, and building the agents 2
-    message = "stopped after 4 episodes of each agent: the service hung up; these are kept"
+    message = "stopped after 4 episodes of each agent: the service hung up; they are kept"
     with pytest.raises(QrlSuiteError, match=message) as caught:
         play()
     assert "\n" not in str(caught.value)
@@ -127,7 +127,7 @@ def test_a_device_that_is_no_simulator_needs_a_yes(trained: EntryStore, unreliab
         "backend": "pennylane device=unreliable.qpu shots=5",
     }  # fmt: skip
     unreliable.batches = 0
-    with pytest.raises(OptionError, match=r"is no simulator: 1 agents.*80 circuits.*400 shots; add --yes"):
+    with pytest.raises(OptionError, match=r"is not a simulator: 1 agents.*80 circuits.*400 shots; add --yes"):
         evaluate(Selection(runs), entry, **given)
     assert unreliable.batches == 0  # nothing was executed
     unreliable.batches = 22
@@ -165,7 +165,7 @@ def test_a_study_executes_nothing_on_hardware(
     path = tmp_path / "hardware.toml"
     path.write_text(STUDY.replace("TASK", tiny_task))
     with pytest.raises(
-        OptionError, match=r"unreliable\.qpu shots=5 is no simulator: a picture executes nothing"
+        OptionError, match=r"unreliable\.qpu shots=5 is not a simulator: a picture executes nothing"
     ):
         api.plot("picture", study=str(path), runs=trained.path.parent.parent)
     assert unreliable.batches == 0

@@ -183,7 +183,7 @@ def test_actions_need_not_be_discrete(walk: Entry) -> None:
     again = evaluation.references(entry, episodes=200)[1]
     assert (again.returns == random.returns).all()
     with pytest.raises(
-        OptionError, match=r"'reinforce' takes discrete actions, and those of task '.*' are Box\(2.0, 3.0"
+        OptionError, match=r"'reinforce' takes discrete actions, and task '.*' has Box\(2.0, 3.0"
     ):
         count_parameters(entry)
 

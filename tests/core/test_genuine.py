@@ -83,7 +83,7 @@ def test_links_in_an_entry_do_not_count(store: EntryStore, linked: str, tmp_path
     (store.path / linked).symlink_to(tmp_path / "elsewhere")
     seeds, (line,) = counted(store)
     assert seeds == (0, 2)
-    assert f"{linked} is a link: links below a results folder are not followed" in line
+    assert f"{linked} is a link: links in a results folder are not followed" in line
 
 
 def test_entries_and_tasks_that_are_links_are_refused_and_the_results_folder_may_be_one(

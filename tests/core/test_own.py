@@ -446,12 +446,12 @@ def test_a_published_study_imports_nothing() -> None:
     """It may have been published before its first seed, so that no entry lies there."""
     write("theirs/evil.py", "raise SystemExit('it runs')\n")
     write(f"theirs/{FILE}", 'plugins = ["evil.py"]\nformat_version = 1\nname = "theirs"\n')
-    with pytest.raises(FileError, match=r"what lies beside results is not imported"):
+    with pytest.raises(FileError, match=r"no file in a results folder may load code from there"):
         published_studies.load(Path("theirs"))
     write(f"runs/{FOLDER}/theirs/{FILE}", Path(f"theirs/{FILE}").read_text())
     outcomes, (line,) = in_folder(Path("runs"))
     assert not outcomes
-    assert "what lies beside results is not imported" in line
+    assert "no file in a results folder may load code from there" in line
 
 
 HELPED = """
@@ -658,7 +658,7 @@ def test_a_copy_that_was_changed_is_written_anew() -> None:
     assert again.source.mark == made.source.mark
     own.unload(again)
     made.source.copy.write_text("raise SystemExit\n")
-    assert "is a copy, and not what it was" in refusal(str(made.source.copy))
+    assert "is a copy that was changed" in refusal(str(made.source.copy))
     made.source.copy.with_name("math.py").symlink_to(write("math.py", "raise SystemExit\n"))
     own.load("ring.py")
     assert not made.source.copy.with_name("math.py").is_symlink()
@@ -791,10 +791,10 @@ class Idle:
         (
             "beam6g",
             "net mistake=divides",
-            r"^ZeroDivisionError.*, line 17: return self.layer\(x\) \*.*: mend",
+            r"^ZeroDivisionError.*, line 17: return self.layer\(x\) \*.*: fix it",
         ),
         ("walk", "mlp", r"RuntimeError: it fell \(mistakes.py, line 27: raise"),
-        ("beam6g", "idle mlp", r"^AttributeError.*\(mistakes.py, line 33: def act.*: mend it, and repeat"),
+        ("beam6g", "idle mlp", r"^AttributeError.*\(mistakes.py, line 33: def act.*: fix it and rerun"),
     ],
 )
 def test_a_mistake_in_a_users_file_is_one_line_that_names_its_place(

@@ -289,7 +289,7 @@ def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Pat
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"varied": ()}, "algorithm.lr is a range, which sampler 'grid' cannot go through"),
+        ({"varied": ()}, "algorithm.lr is a range, and sampler 'grid' needs a list"),
         (
             {"varied": (), "settings": (*SETTINGS, *FIXED, parse_setting("lr=1e-3"))},
             "nothing is varied",
@@ -299,7 +299,7 @@ def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Pat
         ({"varied": varied("lr=[]")}, "the list of values to try is empty"),
         ({"varied": varied("lr={low = 2, high = 1}")}, "low < high is needed"),
         ({"varied": varied("lr={low = 1, high = inf}")}, "finite"),
-        ({"varied": varied("lr={low = 1, high = 2}")}, "is a range, which sampler 'grid' cannot go through"),
+        ({"varied": varied("lr={low = 1, high = 2}")}, "is a range, and sampler 'grid' needs a list"),
         ({"trials": 2}, "--sampler 'random trials=2'"),
         ({"sampler": "random"}, "'random trials=50'"),
     ],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "SECURITY.md").read_text()
-PROMISES = re.findall(r"^- .*(?:\n  .*)*", TEXT.partition("## What can still")[0], re.MULTILINE)
+PROMISES = re.findall(r"^- .*(?:\n  .*)*", TEXT.partition("## Remaining risks")[0], re.MULTILINE)
 TEST = re.compile(r"`([\w/]+\.py)::(test_\w+)`")
 
 

@@ -162,8 +162,8 @@ DATA = {
     "leaderboard/plans/one/plan.toml": "FAILED one: ",
 }
 NAMES = {
-    "leaderboard/entries/beam6g/$(touch pwned)/entry.json": "is no published name",
-    "leaderboard/plans/`touch pwned`/plan.toml": "is no published name",
+    "leaderboard/entries/beam6g/$(touch pwned)/entry.json": "is no valid name",
+    "leaderboard/plans/`touch pwned`/plan.toml": "is no valid name",
 }
 
 

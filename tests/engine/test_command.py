@@ -38,8 +38,8 @@ def words(task: str, runs: Path, template: str, *more: str) -> list[str]:
         ("qsub job.sh", r"no worker is started: write \{command\} where its command belongs"),
         ("ssh node{n} {command}", r"there is no \{n\}; known: command, group, i, quoted"),
         ("ssh node{} {command}", r"there is no \{\}"),
-        ("awk '{print}' {comand}", r"there is no \{print\}.* a brace that the shell is to see is doubled"),
-        ("ssh {command", r"expected '\}' before end of string; a brace that the shell is to see is doubled"),
+        ("awk '{print}' {comand}", r"there is no \{print\}.* double a brace that the shell must see"),
+        ("ssh {command", r"expected '\}' before end of string; double a brace that the shell must see"),
     ],
 )
 def test_a_template_that_starts_no_worker(template: str, message: str) -> None:

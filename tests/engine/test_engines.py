@@ -193,7 +193,7 @@ def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(tr
     assert listed["epochs"] == [1, 2]
     before = results(entry, 0)
     assert "would remove 1 checkpoint" in collect()
-    assert "can then not be extended" in collect()
+    assert "cannot get more epochs afterwards" in collect()
     assert len(checkpoint.headers(store)) == 2, "without --yes nothing is removed"
     held = acquire(store, [1])
     assert "nothing to remove" in collect("--yes"), "a group that is being extended keeps its checkpoint"

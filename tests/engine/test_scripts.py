@@ -298,7 +298,7 @@ def test_a_number_that_is_half_written_ends_no_run(tmp_path: Path) -> None:
     run._look(progress, 1.0)
     assert (progress.epoch, progress.seed_scores) == (2, [0.5])
     (tmp_path / "0.csv").write_text("step,score\n10,0.5\n20,9.5\n30,1")
-    with pytest.raises(QrlSuiteError, match="those of the task from 0 to 1"):
+    with pytest.raises(QrlSuiteError, match="the task's from 0 to 1"):
         run._look(progress, 1.0)
 
 

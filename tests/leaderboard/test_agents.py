@@ -250,7 +250,7 @@ def test_agents_play_another_task_as_that_tasks_own_would(folder: Path, tmp_path
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["tiny/mlp", "--task", "cartpole"], "observations are Box(0.0, 1.0, (3,), float32), and here they are"),
+        (["tiny/mlp", "--task", "cartpole"], "observations are Box(0.0, 1.0, (3,), float32), but here"),
         (["mlp", "--task", "cartpole"], "write 'tiny/mlp'"),
         (["nothing", "--task", "cartpole"], "no entry 'nothing'"),
         (["mlp", "--task", "cartpol"], "did you mean 'cartpole'"),

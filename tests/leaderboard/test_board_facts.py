@@ -225,7 +225,7 @@ def test_the_board_says_where_settings_come_from() -> None:
     )
     assert boards.changed(one, preset="mine.toml").settings == "mine.toml"
     assert boards.changed(one, tuning={"trials": None, "seeds": "1000000:?"}).settings == "tuned"
-    mixed = "tuned and untuned settings are compared: a difference may be one of tuning"
+    mixed = "tuned and untuned settings are compared: a difference may come from tuning"
     text = markdown(boards.of([tuned, released, by_hand]))
     assert mixed in text.split("  \n")
     assert "| tuned (16 trials, 32 seeds) |" in text

@@ -67,7 +67,7 @@ def test_a_folder_named_like_a_command_is_refused_and_runs_nothing(repository: P
     words = ["make", "verify", "-o", "install", "BIN=bin", "BASE=HEAD~1"]
     done = subprocess.run(words, cwd=repository, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
-    assert "is no published name" in done.stderr
+    assert "is no valid name" in done.stderr
     words[-1] = "BASE=HEAD'; touch pwned; '"
     done = subprocess.run(words, cwd=repository, env=environment, capture_output=True, text=True, timeout=120)
     assert "names no commit here" in done.stderr
@@ -78,16 +78,16 @@ def test_a_folder_named_like_a_command_is_refused_and_runs_nothing(repository: P
     ("name", "message"),
     [
         *(
-            (f"leaderboard/entries/beam6g/{name}/entry.json", "is no published name")
+            (f"leaderboard/entries/beam6g/{name}/entry.json", "is no valid name")
             for name in ("`id`", "x;id", "-rf", ".x", "two words", "two\nlines", "\x1b[2J", "\udcff", "Ddqn")
         ),
-        ("leaderboard/unranked/$(id)/x/entry.json", "is no published name"),
-        ("leaderboard/plans/$(id)/plan.toml", "is no published name"),
+        ("leaderboard/unranked/$(id)/x/entry.json", "is no valid name"),
+        ("leaderboard/plans/$(id)/plan.toml", "is no valid name"),
         ("leaderboard/entries/beam6g/entry.json", "holds TASK/ENTRY/"),
         ("leaderboard/entries/beam6g/x/more/entry.json", "holds TASK/ENTRY/"),
         ("leaderboard/entries/beam6g/x/conftest.py", "holds TASK/ENTRY/"),
         ("leaderboard/plans/width/beam6g/looks.jsonl", "holds NAME/"),
-        ("leaderboard/plans/width/beam6g/x/__init__.py", "is no published name"),
+        ("leaderboard/plans/width/beam6g/x/__init__.py", "is no valid name"),
     ],
 )
 def test_names_and_places_that_no_published_file_has_are_refused(

@@ -108,7 +108,7 @@ def test_numbers_that_cannot_be_compared_are_marked() -> None:
     found = section(learner("clock", 20, 2, clocked=True), learner("other", 20, 2), by="core-hours")
     (marked,) = (row for row in found.sheet().cells if row[1] == "clock")
     assert marked[3].startswith("~")
-    assert "~ : not to be compared with the others" in found.notes()
+    assert "~ : not comparable with the others" in found.notes()
     alone = section(learner("clock", 20, 2, clocked=True), by="core-hours")
     assert alone.compared is None
     assert alone.as_dict()["rows"][0]["mean_cost"] is None

@@ -193,7 +193,7 @@ def test_more_seeds_are_added_and_those_here_stay(tmp_path: Path) -> None:
     more = take({"a": ([0, 1], [[1, 2, 4], [2, 3, 4]])})  # the task of the folder says all
     assert (more.new, more.known) == ((1,), (0,))
     assert "seeds 0:1 have other curves in " in more.notes[0]
-    assert f" than in {more.store.path}: these stay, until `qrlsuite runs rm` removes" in more.notes[0]
+    assert f" than in {more.store.path}: yours stay, until `qrlsuite runs rm` removes" in more.notes[0]
     longer = {"a": ([0, 1], [[1, 2, 3, 4], [2, 3, 4, 5]])}
     [after] = api.import_curves(longer, steps=[10, 20, 30, 40], runs=tmp_path)
     assert (after.new, api.load("a", runs=tmp_path).records[0].epochs) == ((0, 1), 4), "the longer curve wins"
@@ -542,7 +542,7 @@ def test_files_and_folders_are_told_apart(qrlsuite: Callable[..., Any], csv: Pat
     (tmp_path / "notes.txt").touch()
     for words, message in (
         (("empty",), "holds no entry"),
-        (("empty", csv), "import folders and files by commands of their own"),
+        (("empty", csv), "import folders and files with separate commands"),
         (("empty", "maximum=3"), "maximum is for files with curves"),
         (("notes.txt",), "give a csv file with the columns entry,seed,step,score"),
         (("none.csv",), "none.csv cannot be read: No such file or directory"),
@@ -574,7 +574,7 @@ def test_seeds_are_planned_like_those_of_a_file(
     assert "against" not in qrlsuite(*words, "fast").stdout
     assert not (tmp_path / "runs").exists(), "nothing is imported"
     assert "'external' is a new task: say what a good score is" in refused("power", "--like", csv)
-    assert "power of which entries? name one or two" in refused("power")
+    assert "name one or two entries: qrlsuite power" in refused("power")
 
 
 def test_names_of_one_s_own_are_shown_as_they_are(

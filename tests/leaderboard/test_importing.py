@@ -163,7 +163,7 @@ def test_a_seed_that_differs_stays_as_it_is_here(copied: EntryStore, elsewhere: 
     folder.table.write_bytes(table_bytes(rows))
     done = import_seeds.import_seeds(copied, tmp_path / "runs")
     assert done.notes == (
-        f"seeds 1:2 have other curves in {copied.path} than in {done.store.path}: these stay, until `qrlsuite runs rm` "
+        f"seeds 1:2 have other curves in {copied.path} than in {done.store.path}: yours stay, until `qrlsuite runs rm` "
         "removes the entry",
     )
 
@@ -177,7 +177,7 @@ def test_a_longer_seed_without_an_agent_takes_none_away(
     copied.seed(1).agent.unlink()
     done = import_seeds.import_seeds(copied, tmp_path / "runs")
     assert (done.new, done.known) == ((), (0, 1))
-    assert done.notes[0].endswith("without their agents: these stay")
+    assert done.notes[0].endswith("without their agents: yours stay")
     assert files(here.path) == before
 
 

@@ -155,7 +155,7 @@ def test_an_export_holds_metrics_which_are_checked(walked: tuple[Path, EntryResu
         ('metric = "steps-taken"', 'metric = "regret"', r"no info\['metrics'\]\['regret'\] at the end .*steps-taken"),
         ('metric = "steps-taken"', 'metric = "late"', "ranking.costs: 'late' is shown twice"),
         ('goal = "below"\n', 'goal = "below"  # nan\n', r"\['late'\] (= nan, which cannot be ranked|at the end)"),
-        ('metric = "steps-taken"\n', "", "goal = 'below' is for a metric: scores and returns are to be high"),
+        ('metric = "steps-taken"\n', "", "goal = 'below' is for a metric: scores and returns should be high"),
         ('goal = "below"', 'goal = "under"', "score.goal"),
         ('goal = "below"', 'goal = "below"\nsource = "return"', "comes from the environment's info: source ="),
         ("thresholds = [9, 7.5, 7.4]", "epsilons = [0.1]", "has no known maximum|the reference cell needs"),

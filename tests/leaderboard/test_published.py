@@ -441,7 +441,7 @@ def test_the_draw_is_fresh_and_can_be_repeated_but_proves_nothing_then(folder: P
     again = verify.verify(folder, rerun=2, choice=first.choice)
     assert (again.seeds, again.digest) == (first.seeds, first.digest)
     assert again.check == "repeated"
-    assert "proves nothing anew" in again.message
+    assert "is no new evidence" in again.message
     assert len({first.choice, *(verify.verify(folder, rerun=1).choice for _ in range(2))}) == 3
     edit(folder, lambda r: r.update(remark="another"))
     assert verify.verify(folder).digest != first.digest, "of other files the same number draws others"

@@ -113,7 +113,7 @@ def test_what_another_program_trained_is_neither_classical_nor_quantum(opened: O
     tab = opened(boards.of([boards.changed(entries[0], imported=ImportedRecord()), *entries[1:]]))
     assert "external" in tab.locator("#board-0-table tbody tr").first.inner_text()
     assert tab.locator("#board-0 .verdict").first.inner_text().startswith("at 2 needs ")
-    assert "Curves that other programs made" in tab.locator("#board-0-notes").inner_text()
+    assert "Curves of other programs" in tab.locator("#board-0-notes").inner_text()
 
 
 def picked(tab: Any) -> list[str]:

@@ -98,7 +98,7 @@ def test_a_pair_whose_decision_may_turn_is_named() -> None:
     facts = {"adjusted": np.full((2, 2), 0.05), "p_error": 2e-5 * ~np.eye(2, dtype=bool)}
     open_still = replace(made, board=replace(made.board, **facts))
     assert open_still.special() == [
-        "within Monte Carlo error of its level after 10 million relabelings: steady and early, "
+        "within Monte Carlo error of its level after 10 million permutations: steady and early, "
         "adjusted p = .05 +- 2e-05"
     ]
     said = pair_on(open_still, scores.finals(section), *made.rows, section.ranking.grid, ("a", "b")).sentence

@@ -68,7 +68,7 @@ def passes(
     out: Any, back: int, cotangents: Any, chosen: Any, aims: Any, share: Any, errors: Any, gradients: Any,
     x_gradients: Any, needed: bool,
 ) -> int:  # fmt: skip
-    """Compute out (S, B, O) of x (S, B, I) if `forth`, then gradients of what `back` names.
+    """Compute out (S, B, O) of x (S, B, I) if `forth`, then gradients by the arguments that `back` names.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def passes(
     cotangents:
         (S, B, O), for OF_COTANGENTS.
     chosen, aims, share, errors:
-        For OF_ERRORS: (S, B) each but `share`; outputs `chosen` minus `aims` are written to `errors`, and gradients are
-        those of the sum of `share` times their squares.
+        For OF_ERRORS: (S, B) each but `share`; outputs `chosen` minus `aims` are written to `errors`, and gradients
+        belong to the sum of `share` times their squares.
     gradients, x_gradients:
         Laid out as parameters and x are; the latter only if `needed`.
     """

@@ -69,7 +69,7 @@ def check(
         raise typer.BadParameter(f"{more_names[0]}: give one name, and its options as OPTION=VALUE")
     chosen |= given
     if chosen and len(items) > 1:
-        raise typer.BadParameter("options are for one thing: name it, qrlsuite check KIND:NAME OPTION=VALUE")
+        raise typer.BadParameter("options need a single name: qrlsuite check KIND:NAME OPTION=VALUE")
     if json_output:
         results = [(item, _findings(item, chosen, more)) for item in items]
         rows = [(item, asdict(finding)) for item, findings in results for finding in findings]
@@ -155,6 +155,6 @@ def _teach(json_output: bool) -> None:
     typer.echo("qrlsuite check FILE.toml        a task of your own")
     typer.echo("\nIn a package's own tests: from qrlsuite.testing import assert_conforms")
     if others:
-        typer.echo(f"\nInstalled plugins of others: {', '.join(printable(name) for name in others)}")
+        typer.echo(f"\nOther installed plugins: {', '.join(printable(name) for name in others)}")
     else:
-        typer.echo("\nNo plugin of others is installed. Begin one: qrlsuite new plugin --help")
+        typer.echo("\nNo other plugin is installed. Begin one: qrlsuite new plugin --help")

@@ -47,7 +47,7 @@ def compare(
         typer.Option(
             "--by",
             metavar="|".join(("steps", *OF_RUNS)),
-            help="What the sentence begins with, or a cost that the task's [ranking] names.",
+            help="The number that decides the verdict, or a cost that the task's [ranking] names.",
         ),
     ] = "steps",
     label: LabelOption = None,

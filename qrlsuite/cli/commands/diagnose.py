@@ -28,7 +28,9 @@ def diagnose(
     ],
     draws: Annotated[
         int,
-        typer.Option("--draws", min=2, help="Of an ansatz: random parameters for the variance of gradients."),
+        typer.Option(
+            "--draws", min=2, help="For an ansatz: draws of random parameters for the variance of gradients."
+        ),
     ] = 100,
     task: Annotated[
         str | None,
@@ -48,15 +50,14 @@ def diagnose(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Say of a circuit, or of trained agents: gradients, Fisher information, frequencies, entanglement.
+    """Analyze a circuit, or trained agents: gradients, Fisher information, frequencies, entanglement.
 
     Of an ansatz, a row for each size: variance of the gradient with a local and a global readout and how it changes
     with each further qubit; rank of the Fisher information, effective dimension, mean frequency along the inputs,
-    expressibility, entanglement, dimension of the dynamical Lie algebra. layers=n says by which law depth grows.
+    expressibility, entanglement, dimension of the dynamical Lie algebra. layers=n is the law by which depth grows.
 
-    Of entries, the best trained agents beside the same before training, at the states where they were: rank, gauge
-    directions and effective dimension, mean frequency, and of circuits the entanglement. Networks without a circuit
-    have all but the last.
+    For entries, the best trained agents beside the same agents before training, at the states that they visit: rank,
+    gauge directions, effective dimension, mean frequency, and the entanglement of circuits.
 
     Example: qrlsuite diagnose ansatz iqp qubits=4:12 --out iqp.png
 

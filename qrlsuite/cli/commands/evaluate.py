@@ -21,8 +21,8 @@ def evaluate(
         list[str] | None,
         typer.Argument(
             metavar="ENTRY...",
-            help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder. None: the reference "
-            "policies of --task alone.",
+            help="Entries of one task: names or labels, or beginnings of them, after [TASK/]; or folders. "
+            "Without entries, only the reference policies of --task play.",
             autocompletion=entries_here,
         ),
     ] = None,
@@ -63,7 +63,7 @@ def evaluate(
     ] = None,
     yes: Annotated[
         bool,
-        typer.Option("--yes", help="Execute circuits on a device that is no simulator; it may cost money."),
+        typer.Option("--yes", help="Execute circuits on a real device, which may cost money."),
     ] = False,
     out: Annotated[
         Path | None,
@@ -75,18 +75,18 @@ def evaluate(
 ) -> None:
     """Play fresh episodes with an entry's best trained agents, and with reference policies.
 
-    With --published, also entries that come with the suite, as far as their agents do.
+    --published adds the entries that come with the suite and have agents.
 
-    The best agents are chosen by their last validation score; these episodes are new, and the same for every
-    policy, so the choice does not raise the result. Agents act as in validation. It shows sums of rewards and,
-    where the task knows a maximum, relative scores. The random policy is always there; an environment may offer
-    others (beam6g: the optimal one and the nearest antenna). A task file may state their scores ([ranking.policies]):
-    boards and learning curves show them.
+    The best agents are chosen by their last validation score; these episodes are new, and the same for every policy, so
+    the choice does not raise the result. Agents act as in validation. It shows sums of rewards and, where the task
+    knows a maximum, relative scores. The random policy always plays; an environment may have others (beam6g: the
+    optimal one and the nearest antenna). A task file may state their scores ([ranking.policies]): boards and learning
+    curves show them.
 
     With --task OTHER, TASK/ENTRY plays another task than it was trained on, if observations and actions are the same.
 
-    With --backend the same agents act with shots, with noise or on a device, beside themselves as they were
-    trained. The cost is printed first. Finished episodes are kept, and not played again.
+    With --backend the same agents act twice: as they were trained, and with shots, with noise or on a device. The cost
+    is printed first. Finished episodes are kept, and not played again.
 
     Example: qrlsuite evaluate vqc-native --backend "qiskit estimator=aer shots=1000"
 

@@ -53,9 +53,9 @@ def export(
     is written as its entries; one with looks with the curves of its seeds, so that others can compute its verdicts
     (`qrlsuite show DIR/NAME`) and go on with it (`qrlsuite import DIR/NAME`); it may be written again while it goes on.
 
-    In FILE.npz stands the share of the horizon that each run spends at or above threshold, mean over the task's
-    thresholds (in [0, 1], more is better), of every entry that was trained on all these --task with the same
-    options. Read the file for rliable by `dict(numpy.load("FILE.npz"))`.
+    FILE.npz holds the share of the horizon that each run spends at or above threshold, mean over the task's thresholds
+    (in [0, 1], more is better), for every entry that was trained on all these --task with the same options. Read the
+    file for rliable by `dict(numpy.load("FILE.npz"))`.
 
     Example: qrlsuite export "mlp width=64" --out leaderboard/entries
     """
@@ -94,8 +94,8 @@ def shortfalls(entry: EntryResults) -> Iterator[str]:
         )
     if entry.plugins:
         yield (
-            f"made with {', '.join(sorted(entry.plugins))}, which is not in it: verify needs --plugin PATH, and "
-            "a public board an issue first (docs/publish.md)"
+            f"made with {', '.join(sorted(entry.plugins))}, which the export does not contain: `verify` "
+            "needs --plugin PATH, and a public board needs an issue first (docs/publish.md)"
         )
 
 

@@ -28,19 +28,20 @@ def import_entries(
         list[str],
         typer.Argument(
             metavar="PATH|OPTION=VALUE",
-            help="Results folders, folders that `export` wrote, or entries' folders in them. Or files with the curves "
-            "of other programs: csv (entry,seed,step,score), evaluations.npz, monitor.csv or progress.csv of "
-            "Stable-Baselines3, event files of TensorBoard. Options of files: maximum=BEST, the best "
-            "possible score: scores become fractions of it; metric=NAME, the column or scalar that is the score; "
-            "for a new task thresholds=A,B,..., scores that count as reached, goal=below where less is better, and "
-            "every=STEPS between grid points. Where `import` asks for it: early=solved, early=failed or early=cut of "
-            "runs that end before the others; units=same where scales differ tenfold.",
+            help="Results folders, folders that `export` wrote, or entries' folders in them. Or files with "
+            "the curves of other programs: csv (entry,seed,step,score), evaluations.npz, monitor.csv "
+            "or progress.csv of Stable-Baselines3, event files of TensorBoard. Options of files: "
+            "maximum=BEST, the best possible score: scores become fractions of it; metric=NAME, the "
+            "column or scalar that is the score; for a new task thresholds=A,B,..., scores that count "
+            "as reached, goal=below where less is better, and every=STEPS between grid points. Where "
+            "`import` asks for it: early=solved, early=failed or early=cut for runs that end before "
+            "the others; units=same where scales differ tenfold.",
         ),
     ],
     task: Annotated[
         str | None,
         typer.Option(
-            "--task", help="Of files: a task of the suite, or the name of a new one; default: external."
+            "--task", help="For files: a task of the suite, or the name of a new one; default: external."
         ),
     ] = None,
     runs: RunsOption = Path("runs"),
@@ -48,9 +49,8 @@ def import_entries(
 ) -> None:
     """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only missing seeds.
 
-    From a results folder, agents and checkpoints are copied too, from an export the agents that it has. A seed
-    that is here already stays, unless it has more epochs there. Stop with Ctrl-C at any time; the same command
-    continues.
+    From a results folder, agents and checkpoints are copied too; from an export, its agents. Your copy of a seed stays,
+    unless the other one has more epochs. Stop with Ctrl-C at any time; the same command continues.
 
     Curves of other programs become external entries, which can be compared and drawn as any. At every grid point
     stands the last score at or before it. A path names a run: logs/small/seed-3/evaluations.npz is seed 3 of `small`.
@@ -60,15 +60,15 @@ def import_entries(
     names, options = divide(words)
     paths = [Path(name) for name in names]
     if not paths:
-        raise OptionError("import what? give a folder or files: qrlsuite import curves.csv maximum=500")
+        raise OptionError("name a folder or files to import: qrlsuite import curves.csv maximum=500")
     files = [path for path in paths if not path.is_dir()]
     given = [*(["--task"] if task is not None else []), *options]
     if files and len(files) < len(paths):
-        raise OptionError("import folders and files by commands of their own")
+        raise OptionError("import folders and files with separate commands")
     if not files and given:
         raise OptionError(
             next((hint for path in paths if not entries(path) and (hint := run_files.below(path))), "")
-            or f"{given[0]} is for files with curves; a folder of this suite says it itself: leave it out"
+            or f"{given[0]} is for files with curves: leave it out for a folder of this suite"
         )
     taken = api.import_curves(files, task=task, runs=runs, **options) if files else None
     done = []

@@ -53,7 +53,7 @@ def leaderboard(
         ),
     ] = None,
     horizon: HorizonOption = None,
-    format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = "table",
+    format_: Annotated[Format, typer.Option("--format", help="Format of the board.")] = "table",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -68,7 +68,8 @@ def leaderboard(
         typer.Option(
             "--rule",
             metavar="NAME",
-            help="Tiers by cells of the grid in the place of ranks: paper, or a name of `qrlsuite list rules`.",
+            help="Show tiers by cells of the grid instead of ranks: paper, or a name of `qrlsuite list "
+            "rules`.",
         ),
     ] = None,
     alpha: AlphaOption = ALPHA,
@@ -89,31 +90,28 @@ def leaderboard(
     ] = False,
     all_codes: Annotated[
         bool,
-        typer.Option(
-            "--all-codes", help="Show entries of every code, and not of the newest with 20 seeds alone."
-        ),
+        typer.Option("--all-codes", help="Show entries of every code, not only of the newest with 20 seeds."),
     ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
 ) -> None:
     """Rank the entries of each task by significant outperformance.
 
-    A outperforms B if it needs significantly fewer environment steps at a threshold of the task and significantly
-    more at none: permutation tests, with Holm's correction over all pairs of the board, so that --alpha is the
-    probability of any false difference. An entry's rank is 1 + the number of entries that outperform it; a range says
-    which ranks the decided pairs leave. The order is by steps below threshold. Entries with fewer than 20 seeds are
-    not ranked. --entry hides other rows, and changes no rank.
+    A outperforms B if it needs significantly fewer environment steps, as a mean over the task's thresholds: permutation
+    tests, with Holm's correction over all pairs of the board, so that --alpha is the probability of any false
+    difference. An entry's rank is 1 + the number of entries that outperform it; a range has all ranks that the decided
+    pairs leave. The order is by steps below threshold. Entries with fewer than 20 seeds are not ranked. --entry hides
+    other rows, and changes no rank.
 
     --rule paper ranks by the paper's definition instead: tiers of significant outperformance in the cells of the
     task's grid, by intervals of the sample complexity.
 
     With --published, your own seeds of a published entry are added to it, or shown beside it if they have fewer
-    epochs. Several --task compare the entries that were trained on all of them with the same options. The page
+    epochs. Several --task compare the entries that were trained on all these tasks with the same options. The page
     also shows the studies with looks in the results folder.
 
-    --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
-    the same budget for all; --entry then compares these alone. Entries whose record does not hold the cost, or not so
-    that it can be compared, have no rank.
+    --by executions, shots or core-hours ranks entries by their cost of learning, as their records say, within the same
+    budget for all; --entry then compares these alone. Entries without a comparable cost in their record have no rank.
     --by score ranks by the mean score of the last tenth of the epochs, --by area by the mean of all epochs, --by spread
     by how far seeds are from the median seed, in steps below threshold. Metrics of the environment that the task file
     names in [ranking] costs are columns; --by their names ranks by them, less first.
@@ -171,8 +169,8 @@ def _left_out(lines: Sequence[str]) -> None:
 
 def _nothing(runs: Path, tasks: Sequence[str]) -> UnknownNameError:
     return UnknownNameError(
-        f"{runs} holds no results{f' of task {tasks[0]}' if tasks else ''} yet: qrlsuite run; "
-        "--published shows those that come with the suite"
+        f"{runs} holds no results{f' of task {tasks[0]}' if tasks else ''} yet: qrlsuite run; --published "
+        "shows the entries that come with the suite"
     )
 
 

@@ -53,9 +53,7 @@ def plugin(
     Examples: qrlsuite new plugin --from ring.py; qrlsuite new plugin acme-ring --from ring.py
     """
     if source is None:
-        raise OptionError(
-            "name the file that it is made of: --from ring.py; docs/plugins.md has files to begin with"
-        )
+        raise OptionError("name the plugin's file: --from ring.py; docs/plugins.md has examples")
     files = scaffold.package(source, name)
     folder = scaffold.write(files, out)
     if json_output:

@@ -17,7 +17,7 @@ def play(
         str,
         typer.Argument(
             metavar="ENTRY",
-            help="Its name or label, [TASK/] before it, the beginning, or folder.",
+            help="Its name or label, or the beginning of one, after [TASK/]; or its folder.",
             autocompletion=entries_here,
         ),
     ],
@@ -41,9 +41,8 @@ def play(
 ) -> None:
     """Show an episode of an entry's best trained agent, as an animation.
 
-    The best agent is that with the highest last validation score, and the episode one that `evaluate` plays. Any
-    environment is shown that draws frames (render_mode="rgb_array"); beam6g shows the field, the antennas, the beam
-    and the path.
+    The best agent has the highest last validation score, and `evaluate` plays the same episode. Every environment that
+    draws frames (render_mode="rgb_array") can be shown; beam6g shows the field, the antennas, the beam and the path.
 
     Example: qrlsuite play "vqc-native qubits=6" --task beam6g --published --out circuit.gif
     """

@@ -57,8 +57,9 @@ def plot(
         list[str] | None,
         typer.Option(
             "--study",
-            help="A picture that this study names, or of its entries; with looks `pairs` and `entries`, too. Repeat it "
-            "for the pairs that several studies with looks compare, each on another task.",
+            help="A picture that this study names, or a picture of its entries; `pairs` and `entries`, "
+            "too, if it has looks. Repeat it for the pairs that several studies with looks compare, "
+            "each on another task.",
         ),
     ] = None,
     horizon: HorizonOption = None,
@@ -66,15 +67,15 @@ def plot(
         str | None,
         typer.Option(
             "--seeds",
-            help="Only these seeds of every entry, 30 or 0:30, and no entry that lacks one: the sample complexity of "
-            "30 runs is another quantity than that of 100.",
+            help="Only these seeds of every entry, 30 or 0:30. Entries that lack one are left out: sample "
+            "complexities of 30 and of 100 runs are not comparable.",
         ),
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help="png, pdf or svg; default: TASK-KIND.png, in the results folder where it shows results.",
+            help="png, pdf or svg; default: TASK-KIND.png, in the results folder if it shows results.",
         ),
     ] = None,
     published: PublishedOption = False,

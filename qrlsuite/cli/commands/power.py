@@ -21,8 +21,8 @@ def power(
         list[str] | None,
         typer.Argument(
             metavar="ENTRY [ENTRY]",
-            help="An entry like those to compare, with two seeds or more; and another one, to be told apart from it. "
-            "With --like also options of `import`, such as maximum=500.",
+            help="An entry like the ones to compare, with two seeds or more; and a second one, to ask "
+            "about this pair. With --like also options of `import`, such as maximum=500.",
             autocompletion=entries_here,
         ),
     ] = None,
@@ -60,7 +60,7 @@ def power(
     else:
         entries = list(words or ())
     if not 1 <= len(entries) <= 2:
-        raise OptionError("power of which entries? name one or two: qrlsuite power 'mlp width=64'")
+        raise OptionError("name one or two entries: qrlsuite power 'mlp width=64'")
     found = api.power(
         *entries, task=task, draws=draws, runs=runs, published=published, progress=not json_output
     )

@@ -76,7 +76,7 @@ def run(
         bool,
         typer.Option(
             "--quick",
-            help=f"A small budget: 8 seeds, 10 epochs, {QUICK_QUBITS} qubits; less of what is slow.",
+            help=f"A small budget: 8 seeds, 10 epochs, {QUICK_QUBITS} qubits; less where training is slow.",
         ),
     ] = False,
     start: Annotated[
@@ -95,7 +95,7 @@ def run(
     same: SameOption = None,
     track: TrackOption = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Also start a training that will take more than a day.")
+        bool, typer.Option("--yes", help="Start even if training will take more than a day.")
     ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,

@@ -85,7 +85,9 @@ def runs(
 @app.command("gc")
 def collect_garbage(
     task: TaskOption = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Remove them; without it they are only listed.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Remove them. Without this option they are only listed.")
+    ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -112,8 +114,8 @@ def collect_garbage(
         typer.echo(f"removed, {size_text(freed)} freed")
         return
     typer.echo(
-        f"would remove {len(items)} checkpoint{'s' * (len(items) > 1)}, {size_text(total)}. Curves and trained agents "
-        "stay, but these seeds can then not be extended by more epochs. To do it: "
+        f"would remove {len(items)} checkpoint{'s' * (len(items) > 1)}, {size_text(total)}. Curves and "
+        "trained agents stay, but these seeds cannot get more epochs afterwards. To remove them: "
         + command("runs", "gc", *(["--task", task] if task else []), "--yes", runs=runs)
     )
 
@@ -134,7 +136,7 @@ def delete_entries(
         typer.Option(
             "--seeds",
             metavar="'SEEDS reason=...'",
-            help="Only these, there or not: they are no longer asked for, and every verdict says why.",
+            help="Withdraw only these seeds, and delete their results; every verdict names the reason.",
         ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
@@ -199,7 +201,7 @@ def _row(status: EntryStatus, now: float) -> tuple[str, ...]:
 def _unfinished(status: EntryStatus) -> list[str]:
     """Return a line for each group of an entry that has not finished."""
     problem = status.queue_problem
-    silent = [f"the queue was not asked, seeds may have left it: {problem}"] if problem else []
+    silent = [f"could not ask the queue, so seeds may have left it: {problem}"] if problem else []
     again = f"  continued by the same `qrlsuite {'study run' if status.study else 'run'}`"
     lines = (group.text + again * (group.state == "stopped") for group in status.groups)
     return [f"  {line}" for line in (*silent, *lines)]

@@ -26,8 +26,8 @@ def show(
         list[str] | None,
         typer.Argument(
             metavar="NAME|OPTION=VALUE",
-            help="With a kind first, the name: `show ansatz iqp`. Further studies, each of another task. Options of an "
-            "ansatz, and qubits=4 layers=2.",
+            help="After a kind, the name: `show ansatz iqp`. After a study, further studies of other "
+            "tasks. After an ansatz, its options, and qubits=4 layers=2.",
         ),
     ] = None,
     out: Annotated[
@@ -35,15 +35,16 @@ def show(
         typer.Option(
             "--out",
             metavar="FILE",
-            help="Of an ansatz: draw to this png, pdf or svg file. Of a study: write the table to this tex or md file.",
+            help="For an ansatz: draw to this png, pdf or svg file. For a study: write the table to this "
+            "tex or md file.",
         ),
     ] = None,
     format: Annotated[
         str | None,
         typer.Option(
             "--format",
-            help="For an ansatz: print the circuit for others: qasm3, or a program with qiskit or pennylane. For a "
-            "task: toml, its file.",
+            help="For an ansatz: print the circuit as qasm3, or as a program with qiskit or pennylane. For "
+            "a task: toml prints its file.",
         ),
     ] = None,
     code: Annotated[
@@ -57,9 +58,9 @@ def show(
 ) -> None:
     """Show options with their defaults and meaning, a task's protocol, how far a study is, or how an entry was made.
 
-    A study is given by name, or as its file or the folder of a published one. Of a study you see the seeds that are
-    finished and the cost of the missing ones; of a study with looks the verdicts, and the needs of open pairs; of
-    several, each of another task, the pairs that all of them compare, on average over the tasks.
+    A study is given by name, or as its file or the folder of a published one. For a study you see the finished seeds
+    and the cost of the missing ones; for a study with looks the verdicts, and the needs of open pairs; for several,
+    each of another task, the pairs that all studies compare, on average over the tasks.
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp qubits=4;
     qrlsuite show ansatz iqp --format qasm3; qrlsuite show picture bars; qrlsuite show fig7 --published;
@@ -73,7 +74,7 @@ def show(
         found: Any = read_study(*studies, runs=runs)
     elif len(names) > 1:
         raise typer.BadParameter(
-            f"{' '.join([name, *names])}: give one name, with a kind before it or without; or several studies"
+            f"{' '.join([name, *names])}: give one name, after a kind or alone; or several studies"
         )
     else:
         kind, target = (name, names[0]) if names else (None, name)

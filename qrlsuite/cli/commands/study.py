@@ -54,8 +54,9 @@ WordsArgument = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="WORD|OPTION=VALUE",
-        help="Only entries with one of these words in group, label or task, or with this name. qubits=6 sets an option "
-        "wherever an entry has it; vqc-native=vqc-pennylane puts a model in the place of another.",
+        help="Only entries with one of these words in group, label or task, or with this name. qubits=6 "
+        "sets an option wherever an entry has it; vqc-native=vqc-pennylane replaces a model by "
+        "another.",
     ),
 ]
 
@@ -140,7 +141,7 @@ def run(
 ) -> None:
     """Train a study's missing seeds, the entry that lacks least first.
 
-    Entries are those that `qrlsuite run` trains, in the same folders: nothing is trained twice. Stop with Ctrl-C at
+    `qrlsuite run` trains the same entries in the same folders: nothing is trained twice. Stop with Ctrl-C at
     any time, or give a --budget; the same command continues. `all` begins with the study that lacks least.
 
     A study with looks is trained look by look, until every pair is decided or the last look was taken. An entry stops

@@ -57,9 +57,9 @@ def tune(
         typer.Option(
             "--vary",
             metavar="NAME=VALUES",
-            help="What is varied: 'lr=1e-3,5e-4', 'lr={low=1e-4, high=1e-2, log=true}', or a grid: `paper`, or a "
-            "file's path; or settings to be tried first, 'lr=.002 buffer=10000' or preset=FILE.toml. Default: the "
-            "options that models and algorithms name for tuning.",
+            help="The varied options: 'lr=1e-3,5e-4', 'lr={low=1e-4, high=1e-2, log=true}', or a grid: "
+            "`paper`, or a file's path; or settings to be tried first, 'lr=.002 buffer=10000' or "
+            "preset=FILE.toml. Default: the options that models and algorithms name for tuning.",
         ),
     ] = None,
     sampler: Annotated[
@@ -99,7 +99,7 @@ def tune(
             "--budget",
             metavar="TIME",
             help="Time for all trials, 30min or 8h: one that would take longer is not begun. For bayesian, "
-            "2core-hours: as many trials as that holds, for each entry.",
+            "2core-hours: as many trials as fit, for each entry.",
         ),
     ] = None,
     out: Annotated[
@@ -107,7 +107,7 @@ def tune(
         typer.Option("--out", metavar="FILE.toml", help="The preset file; default: below --runs."),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help=f"Start a search of more than {LARGE} trials.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what it would train, and stop.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the planned trials, and stop.")] = False,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     device: DeviceOption = "cpu",
@@ -138,7 +138,7 @@ def tune(
         return
     _report(searches, runs, complete)
     if not complete and not any(each.trials or each.pending for each in searches):
-        raise OptionError("--budget does not hold one trial: give more time, or fewer --seeds or --epochs")
+        raise OptionError("--budget is too small for one trial: give more time, or fewer --seeds or --epochs")
 
 
 def _require_few(searches: Sequence[Search]) -> None:
@@ -147,7 +147,7 @@ def _require_few(searches: Sequence[Search]) -> None:
     )  # which ends by itself
     if planned > LARGE:
         raise OptionError(
-            f"{planned} trials are many: --yes starts them all, --budget 2h as many as that holds, "
+            f"{planned} trials are many: --yes starts all, --budget 2h as many as fit into 2 hours, "
             "--sampler 'random trials=50' tries fewer"
         )
 

@@ -28,8 +28,9 @@ def verify(
         typer.Option(
             "--rerun",
             metavar="N|auto",
-            help="Seeds of each entry to train again; auto: as many as find a tenth forged with probability .95. '2 "
-            "choice=31' trains those of an earlier check again, by the number that it printed; proves nothing anew.",
+            help="Seeds of each entry to train again; auto: as many as find a tenth forged with "
+            "probability .95. '2 choice=31' repeats the seeds of an earlier check, by the number that "
+            "it printed; this is no new evidence.",
         ),
     ] = "0",
     base: Annotated[
@@ -47,7 +48,7 @@ def verify(
     Files: hashes, names and labels are computed again; every seed must have every epoch, and scores in range.
     With --rerun, seeds of each entry are drawn after its files are read, and trained from nothing; the cost is printed
     first. An entry is `verified` if all curves come out bit for bit. A curve that differs is a failure on the same
-    type of machine with the same versions. Elsewhere it is not compared beyond its beginning. Parameters and circuit
+    type of machine with the same versions. Elsewhere only its beginning is compared. Parameters and circuit
     executions are counted again. Reports of one digest belong together: one failure among them stands. Exit
     code 1 if an entry fails.
 
