@@ -1,4 +1,4 @@
-"""Several tasks at once: entries of one configuration, by mean time below threshold as a share of the horizon.
+"""Several tasks at once: entries of one configuration, by mean steps below threshold as a share of the horizon.
 
 A configuration is an algorithm and a model with all their options. The statistics are in
 `qrlsuite.statistics.across`.
@@ -45,7 +45,7 @@ class Shares:
     tasks, horizons:
         K tasks, and the environment steps at which each is cut.
     values:
-        By the entry's label, per task: each run's mean time below the task's thresholds as a share of the horizon,
+        By the entry's label, per task: each run's mean steps below the task's thresholds as a share of the horizon,
         shape (runs,), in [0, 1]; less is better.
     refused:
         Lines about entries that were left out, and why.

@@ -1,4 +1,4 @@
-"""The board by environment steps: ranks by time below threshold, tiers by the paper's definition, horizon by horizon.
+"""The board by environment steps: ranks by steps below threshold, tiers by the paper's definition, horizon by horizon.
 
 Everything is computed here from raw curves. Entries that are shorter than the task's shortest horizon stand in
 a provisional section of their own length.

@@ -28,7 +28,7 @@ ALPHA = 0.05
 
 @dataclass(frozen=True, eq=False)
 class TimeRow:
-    """One entry, ordered by M: its mean time below threshold over its runs and the grid's thresholds, in steps.
+    """One entry, ordered by M: its mean steps below threshold over its runs and the grid's thresholds.
 
     Attributes
     ----------
@@ -172,7 +172,7 @@ def rank_by_time(
     alpha: float = ALPHA,
     shown: Callable[[EntryResults], bool] | None = None,
 ) -> TimeRanking:
-    """Rank the entries of a section by mean time below threshold.
+    """Rank the entries of a section by mean steps below threshold.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A study with looks: its pairs, with intervals and verdicts, or its entries by mean time; several: pairs by task."""
+"""A study with looks: its pairs, with intervals and verdicts, or its entries by mean steps; several: pairs by task."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TICKS = (0.1, 0.2, 0.333, 0.5, 0.667, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
-"""Ratios of mean times that the axis may name."""
+"""Ratios of mean steps that the axis may name."""
 WIDEST = (TICKS[0], TICKS[-1])
 TUNED = ", tuned"
 """End of a tuned entry's name, which the untuned model's name lacks."""
@@ -41,7 +41,7 @@ LOOKS: dict[Decided | None, tuple[str, str, str]] = {
 def draw(outcome: State) -> Figure:
     """Draw a row for each pair, below the question that it answers.
 
-    The axis is B's mean time below threshold over A's, in logarithms: twice as long is as far to the right as half as
+    The axis is B's mean steps below threshold over A's, in logarithms: twice as long is as far to the right as half as
     long is to the left. Lines are repeated confidence intervals. Both are cut at a factor of 10.
     """
     study, decision = outcome.study, outcome.decision
@@ -82,7 +82,7 @@ def draw(outcome: State) -> Figure:
 
 
 def draw_entries(outcome: State) -> Figure:
-    """Draw each entry that a look has reached by its mean time below threshold M, the shortest first.
+    """Draw each entry that a look has reached by its mean steps below threshold M, the shortest first.
 
     An entry called `X, tuned` shares the row of the entry X.
     """

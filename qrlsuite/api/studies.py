@@ -212,7 +212,7 @@ def run_study(
     -------
     Overview, or State of a study with looks
         The entries with their trained and missing seeds; `submitted`; and `as_dict()`. With looks: `pairs`, each with
-        its `verdict`, `difference` (the second's mean time below threshold over the first's, minus 1), `interval`, `p`
+        its `verdict`, `difference` (the second's mean steps below threshold over the first's, minus 1), `interval`, `p`
         and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
 
     Raises

@@ -7,7 +7,7 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
 - `steps`: relabelings until no decision can turn, intervals that belong to p, and the limits of few runs.
-- `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times; `pair`: one of them.
+- `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean steps; `pair`: one of them.
 - `sequential`: as many runs as it takes to decide, at one error for all looks.
 - `simulation`: how often all this errs. `planning`: how many runs it takes.
 - `across`: several tasks at once. `final`: entries by their scores at the end, or over all of training.

@@ -1,9 +1,9 @@
-"""Several tasks at once: entries by their mean time below threshold as a share of each task's horizon.
+"""Several tasks at once: entries by their mean steps below threshold as a share of each task's horizon.
 
 One number per run and task, in [0, 1], less is better: `horizon_shares`. The aggregates are from rliable
 (Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice"): mean and
 interquartile mean with a stratified bootstrap (runs are redrawn within tasks), and the probability of improvement.
-Of one pair, `mean_ratio` averages the ratios of the mean times, so that no task counts for more because it is longer.
+Of one pair, `mean_ratio` averages the ratios of the mean steps, so that no task counts for more because it is longer.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Scores = Mapping[str, Sequence[ArrayLike] | NDArray[np.floating]]
 
 
 def horizon_shares(entry: LearningCurves, grid: Grid) -> FloatArray:
-    """Return, shape (N,): each run's mean time below the grid's thresholds, as a share of the horizon."""
+    """Return, shape (N,): each run's mean steps below the grid's thresholds, as a share of the horizon."""
     shares: FloatArray = times_below(entry.values, grid, entry.steps_per_epoch).mean(axis=1) / entry.horizon
     return shares
 
@@ -250,7 +250,7 @@ class MeanRatio:
     Attributes
     ----------
     differences:
-        On each task: the second's mean time over the first's.
+        On each task: the second's mean steps over the first's.
     difference, interval:
         The geometric mean of the ratios over the tasks, and its confidence interval. The tasks are fixed: only the
         seeds are drawn, so nothing follows for other tasks.
@@ -273,7 +273,7 @@ class MeanRatio:
 
 
 def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) -> MeanRatio:
-    """Compare two entries on average over tasks, by the log ratios of their mean times.
+    """Compare two entries on average over tasks, by the log ratios of their mean steps.
 
     The error of each task's log ratio follows from the delta method; the error of the mean has Welch and
     Satterthwaite's degrees of freedom.
@@ -305,7 +305,7 @@ def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) 
     found = [log_ratios(pair) for pair in pairs]
     ratios, errors, freedoms = (np.array([float(each[part][1, 0]) for each in found]) for part in range(3))
     if not np.isfinite(ratios).all():
-        raise OptionError("an entry is below no threshold for a single step: there is no ratio of mean times")
+        raise OptionError("an entry is below no threshold for a single step: there is no ratio of mean steps")
     variance, slack = (errors**2).sum(), (errors**4 / freedoms).sum()
     freedom = variance**2 / slack if slack else math.inf
     mean, error = ratios.mean(), math.sqrt(variance) / len(pairs)

@@ -1,4 +1,4 @@
-"""One pair by its times below threshold: the verdict of the pair, and every threshold with an interval of its own.
+"""One pair by its steps below threshold: the verdict of the pair, and every threshold with an interval of its own.
 
 The verdict is the one on a board of these two (`times_board`): rule `steps` at level alpha, from 4 runs on.
 """
@@ -36,7 +36,7 @@ class TimesPair:
     p, p_error:
         p of the pair, NaN if undecided; its Monte Carlo error where more relabelings could turn the verdict, else 0.
     difference:
-        Shape (3,): mean time of the first over mean time of the second, minus 1, and its interval at level 1 - alpha,
+        Shape (3,): mean steps of the first over mean steps of the second, minus 1, and its interval at level 1 - alpha,
         half an epoch's steps added to both. The interval is NaN if undecided.
     detectable:
         The share of steps that one entry would have to save for these runs to show it with a power of .8.
@@ -50,7 +50,7 @@ class TimesPair:
     p_each:
         Shape (E,): p of each threshold, adjusted for all of them.
     means:
-        Shape (2, E): mean time below each threshold in steps.
+        Shape (2, E): mean steps below each threshold.
     differences:
         Shape (E, 3): as `difference`, for each threshold; all intervals together at level 1 - alpha.
     at_cap:
@@ -83,7 +83,7 @@ def times_pair(
     seed: int = 0,
     seconds: float = math.inf,
 ) -> TimesPair:
-    """Compare two entries by their time below the grid's E thresholds.
+    """Compare two entries by their steps below the grid's E thresholds.
 
     Parameters
     ----------

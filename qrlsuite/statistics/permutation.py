@@ -122,7 +122,7 @@ class MaxT:
     Parameters
     ----------
     pairs:
-        P pairs of whole-number arrays (N_A, E) and (N_B, E), one row per run: for instance the times below
+        P pairs of whole-number arrays (N_A, E) and (N_B, E), one row per run: for instance the steps below
         threshold in steps. Row i of a pair's two arrays need not belong together.
     blocks:
         Runs of both entries per block, in the order of the rows, the same for all pairs: labels are exchanged
@@ -482,7 +482,7 @@ def _interleaved(pair: tuple[IntArray, IntArray], blocks: Blocks) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class TimesRule:
-    """Significant where the mean time below a threshold differs; all deltas of a threshold get its sign.
+    """Significant where the mean steps below a threshold differ; all deltas of a threshold get its sign.
 
     The statistic is Welch's t of the times T(eps) (see `qrlsuite.statistics.times`), with one critical value for
     all E thresholds from relabelings of whole runs (see `MaxT`). It is computed from all runs of both entries,
@@ -563,10 +563,10 @@ class StepsRule(TimesRule):
 
 
 def with_half_epoch(times: IntArray, epoch: int) -> IntArray:
-    """Return twice the times below threshold, in steps, with half an epoch's steps added: never 0, and whole."""
+    """Return twice the steps below threshold, with half an epoch's steps added: never 0, and whole."""
     return 2 * times + epoch
 
 
 def times_of(evidence: Evidence) -> IntArray:
-    """Return the times below threshold in steps of all runs of an entry, shape (N, E)."""
+    """Return the steps below threshold of all runs of an entry, shape (N, E)."""
     return times_below(evidence.entry.values, evidence.grid, evidence.steps_per_epoch)

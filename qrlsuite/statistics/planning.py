@@ -110,7 +110,7 @@ def runs_to_detect(pilot: SmoothedRuns, grid: Grid, slower_by: float, **options:
 def runs_at_difference(decision: Decision, pair: PairDecision, power: float = 0.8) -> int | None:
     """Return about how many runs would find an open pair's present difference with a power, if it is real.
 
-    By the normal approximation of the log ratio of mean times, at the level of the pair's next look: a rule of thumb,
+    By the normal approximation of the log ratio of mean steps, at the level of the pair's next look: a rule of thumb,
     for the present difference is an estimate itself. None before the pair's first look, or where its difference is 0
     or has no standard error.
 

@@ -8,7 +8,7 @@ is closed as equal is not rejected: it keeps its share of alpha.
 
 The test is the test of rule `steps` or `times` (`MaxT`); labels are exchanged within the block of seeds that each look
 added. By `steps`, relabelings of a look go on until no decision can turn.
-A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
+A pair is equal within the margin if two one-sided tests on the log ratio of the mean steps say so (Schuirmann
 1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
 
 A claim about an entry and several rivals has an error alpha of its own, on one side. That the entry beats all of them
@@ -226,7 +226,7 @@ class SequentialDesign:
     spending:
         How alpha is spent over the looks.
     margin:
-        Ratios of mean times within 1 / (1 + margin) and 1 + margin are equal enough.
+        Ratios of mean steps within 1 / (1 + margin) and 1 + margin are equal enough.
     equal_from:
         Runs from which a pair may be found equal.
     pairs:
@@ -351,7 +351,7 @@ class PairDecision:
     p, levels:
         p and the level it was compared with last, at each look so far.
     difference:
-        Mean time of the second over mean time of the first, minus 1, at the last look. After an early stop it is biased
+        Mean steps of the second over mean steps of the first, minus 1, at the last look. After an early stop it is biased
         away from 0.
     interval:
         Repeated confidence interval of the difference (Jennison and Turnbull 1989). All pairs at all looks together are
@@ -556,7 +556,7 @@ def _lost(claim: Claim, pairs: Sequence[PairDecision]) -> bool:
 
 
 def judged_numbers(design: SequentialDesign, times: IntArray, epoch: int) -> IntArray:
-    """Return what a design's rule judges, given times below threshold (..., N, E): the same, or one number per run."""
+    """Return what a design's rule judges, given steps below threshold (..., N, E): the same, or one number per run."""
     return times if design.rule == "times" else with_half_epoch(times, epoch).sum(axis=-1, keepdims=True)
 
 

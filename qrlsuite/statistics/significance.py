@@ -5,7 +5,7 @@ common number of runs, and returns +1 where the first entry needs significantly 
 needs significantly more and 0 elsewhere. Outperformance and ranking follow from the cells in one way for every
 rule, see `qrlsuite.statistics.compare`.
 
-Here is the paper's, `IntervalRule`: the 5th to 95th percentile intervals do not overlap. Rules for times below
+Here is the paper's, `IntervalRule`: the 5th to 95th percentile intervals do not overlap. Rules for steps below
 threshold are in `qrlsuite.statistics.permutation`.
 """
 

@@ -101,7 +101,7 @@ def slower(entry: LearningCurves, factor: float) -> LearningCurves:
 def draw_times(
     model: SmoothedRuns, n_runs: int, n_entries: int, grid: Grid, generator: np.random.Generator
 ) -> IntArray:
-    """Return the times below threshold in steps of independent entries, shape (n_entries, n_runs, E)."""
+    """Return the steps below threshold of independent entries, shape (n_entries, n_runs, E)."""
     entries, runs = whole(n_entries, "n_entries", at_least=1), whole(n_runs, "n_runs", at_least=1)
     drawn = []
     for done in range(0, entries * runs, _DRAWN):

@@ -1,4 +1,4 @@
-"""Time below threshold: one number per run behind the sample-complexity surface.
+"""Steps below threshold: one number per run behind the sample-complexity surface.
 
 T_i(eps) = steps per epoch x number of epochs in which run i scores less than 1 - eps, from 0 to the horizon.
 S_hat(eps, delta) counts the epochs with P_hat_t < delta, and the integral of that over delta in (0, 1] is
@@ -76,7 +76,7 @@ def epochs_of_runs(curves: Curve, grid: Grid) -> IntArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeanTime:
-    """The mean time below threshold of one entry, over its runs and the grid's E thresholds.
+    """The mean steps below threshold of one entry, over its runs and the grid's E thresholds.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class MeanTime:
 
 
 def mean_time(entry: LearningCurves, grid: Grid, level: float = 0.95) -> MeanTime:
-    """Return the mean time below threshold, with an interval.
+    """Return the mean steps below threshold, with an interval.
 
     Parameters
     ----------

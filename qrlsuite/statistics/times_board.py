@@ -1,7 +1,7 @@
-"""All pairs of a board by their time below threshold: who outperforms whom, by how much, and which ranks remain.
+"""All pairs of a board by their steps below threshold: who outperforms whom, by how much, and which ranks remain.
 
 The verdicts by which boards rank; tiers by the paper's definition are in `qrlsuite.statistics.board`. The order is by
-mean time M. A pair is decided if Holm's procedure over all pairs of the board rejects its test by rule `steps`: for
+mean steps M. A pair is decided if Holm's procedure over all pairs of the board rejects its test by rule `steps`: for
 entries of equal laws the probability of any false decision on the whole board is alpha at most.
 """
 
@@ -119,7 +119,7 @@ def times_board(
     horizon: int | None = None,
     seed: int = 0,
 ) -> TimesBoard:
-    """Compare all pairs of M entries by their mean time below threshold.
+    """Compare all pairs of M entries by their mean steps below threshold.
 
     Entries with fewer than 20 runs stand apart, like incomplete ones: no pair with them is tested or counted.
     Numbers of runs may differ. Relabelings go on until no decision can turn.

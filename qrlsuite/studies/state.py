@@ -155,7 +155,7 @@ class State(Shown):
         return replace(self, study=study, decision=decision, **facts)
 
     def mean_times(self) -> dict[str, MeanTime]:
-        """Return M of each entry, its mean time below threshold, over the seeds of its last look.
+        """Return M of each entry, its mean steps below threshold, over the seeds of its last look.
 
         Entries that no look has reached are absent.
         """

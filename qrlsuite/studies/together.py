@@ -267,7 +267,7 @@ def _shared(studies: Sequence[State]) -> Iterator[tuple[str, str, str]]:
 
 
 def _times(state: State, name: str) -> IntArray:
-    """Return an entry's times below each threshold at the first look, (N, E)."""
+    """Return an entry's steps below each threshold at the first look, (N, E)."""
     curves = state.curves[name]
     return times_below(curves.values[: state.study.design.looks[0]], state.study.grid, curves.steps_per_epoch)
 
