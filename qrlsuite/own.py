@@ -49,7 +49,7 @@ from qrlsuite.files import read_bytes
 from qrlsuite.registry import Plugin, Registered, Registry
 
 MOST_BYTES, MOST_FILES = 16 << 20, 500
-"""The limits of a plugin's size."""
+"""The largest size of a plugin."""
 _MOST_WORDS = 300
 """Shown characters of an error's message."""
 

@@ -45,7 +45,7 @@ HANDED = ("envs", "build_model", "streams", "device")
 
 
 ASKED = ("generator", "space", "role")
-"""What a model's class is built with where it has such a parameter, see `qrlsuite.specs.ModelSpec`."""
+"""Arguments of a model's class, if it has such parameters, see `qrlsuite.specs.ModelSpec`."""
 
 
 PRIVATE = "_qrlsuite_"
@@ -129,7 +129,7 @@ def has_one_size(function: Any) -> bool:
 
 
 def lacking(things: Iterable[Any]) -> str:
-    """Say which methods the first class lacks that trains or acts like an algorithm; empty where there is none."""
+    """Name the methods that the first class lacks that trains or acts like an algorithm; empty without such a class."""
     for thing in things:
         if not isinstance(thing, type) or kind_of(thing) is not None:
             continue
@@ -179,7 +179,7 @@ def recognized(module: ModuleType) -> list[Any]:
 
 
 def notes(module: ModuleType) -> list[str]:
-    """Say of every network in a module that calls a QNode how it is trained faster."""
+    """Describe how networks in a module that call a QNode are trained faster."""
     found = []
     for cls in public(module):
         if kind_of(cls) is not specs.ModelSpec:

@@ -87,7 +87,7 @@ class ScoreSection:
 
     @property
     def meaning(self) -> str:
-        """What the number is."""
+        """The meaning of the number."""
         match self.by:
             case "area":
                 return f"area: mean {self.of} over all epochs"

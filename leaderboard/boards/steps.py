@@ -58,7 +58,7 @@ class Support:
 
     @property
     def sentence(self) -> str:
-        """Who won, and how many cells say nothing."""
+        """The winner, and the number of cells that say nothing."""
         return f"{self.winner} against {self.loser}: {self.at_cap} of {self.total} cells at the cap for both"
 
 

@@ -163,7 +163,7 @@ def policies_text(section: Section) -> str:
 
 
 def tier_notes(section: Section) -> list[str]:
-    """Say what tiers are, and why an entry has none."""
+    """Define tiers, and explain why an entry has none."""
     return [
         "tier: 1 + the longest chain of entries above, each outperforming the next; sample complexity at "
         f"{section.ranking.cell}{policies_text(section)}",
@@ -275,7 +275,7 @@ def _failed(entries: Sequence[EntryResults], horizon: int | None) -> dict[str, i
 
 
 def missing(entries: Sequence[EntryResults]) -> list[str]:
-    """Name the seeds that were asked for and are not there, with what to do, and the requests that were withdrawn."""
+    """Name the seeds that are missing, with the remedy, and the requests that were withdrawn."""
     notes = {
         "incomplete, without rank until these seeds are trained (`qrlsuite run`) or withdrawn (`qrlsuite runs rm "
         "ENTRY --seeds`)": {entry.label: entry.missing_text for entry in entries if entry.missing},

@@ -71,7 +71,7 @@ class Live:
             rest = max(LOOKS, REST * (time.monotonic() - began))
 
     def end(self) -> None:
-        """Have `watch` return."""
+        """Make `watch` return."""
         self._ended.set()
 
     def _compute(self) -> None:

@@ -164,7 +164,7 @@ class EntryResults(Shown):
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """What the entry's hash covers: task, algorithm, model and their resolved options."""
+        """The content of the entry's hash: task, algorithm, model and their resolved options."""
         return self.record.identity.content
 
     @property
@@ -199,7 +199,7 @@ class EntryResults(Shown):
 
     @property
     def made(self) -> str:
-        """Who made external curves, in words."""
+        """The origin of external curves, in words."""
         return "by a script, not repeatable here" if self.algorithm == SCRIPT else "by another program"
 
     @property
@@ -343,7 +343,7 @@ class EntryResults(Shown):
 
     @property
     def declared(self) -> list[str]:
-        """What its seeds have in common by declaration of the plugins."""
+        """The things that its seeds share by declaration of the plugins."""
         return sorted({line for probe in probes.of_records(self._run_records) for line in probe.declared})
 
     @cached_property

@@ -169,7 +169,7 @@ def _shared(entries: Sequence[EntryResults]) -> dict[str, tuple[pyarrow.Array, d
 
 
 def _metrics(entry: EntryResults, rows: Rows) -> dict[str, NDArray[np.float64]]:
-    """Return metrics of the environment by column, and in rows of epochs those of training."""
+    """Return metrics of the environment by column, and in rows of epochs the metrics of training."""
     training = entry.training if rows == "epochs" else {}
     of_training = {f"training.{name}": values for name, values in training.items()}
     return {**of_training, **{f"{MEASURED}.{name}": values for name, values in entry.metrics.items()}}

@@ -1,6 +1,6 @@
 """Fingerprints of seeds before their first epoch: numbers that agree on machines whose later bits differ.
 
-A published entry carries them, and whoever trains its seeds again elsewhere computes them anew.
+A published entry carries them, and a machine that trains its seeds again computes them anew.
 """
 
 from __future__ import annotations

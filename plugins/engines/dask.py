@@ -51,7 +51,7 @@ CALL = (
     f"__import__('{MODULE}', fromlist=['work']).work(*task) "
     "if __import__('importlib.util').util.find_spec('qrlsuite') else b''"
 )
-"""What a Dask worker evaluates. A pickled function of ours would end a worker that cannot import it."""
+"""The text that a Dask worker evaluates. A pickled function of ours would end a worker that cannot import it."""
 
 TASKS = 10
 """Tasks at a time, where no number of workers was asked for and the scheduler is somebody else's."""
@@ -90,7 +90,7 @@ class DaskOptions:
 
 
 def work(mark: str, arguments: Sequence[str], environment: Mapping[str, str]) -> bytes:
-    """Be a task: start a group's worker, and return its exit code and output.
+    """Run a task: start a group's worker, and return its exit code and output.
 
     The worker saves and ends when the task is canceled, which a client's end does too, or the Dask worker ends.
 
@@ -212,7 +212,7 @@ class Cluster:
         self._begun, self._looked = time.monotonic(), False
 
     def submit(self, job: WorkerJob, mark: str) -> None:
-        """Have a group's worker started on a machine of the cluster."""
+        """Start a group's worker on a machine of the cluster."""
         task = (mark, worker_command(job.work, job.group)[1:], worker_environment())
         try:
             self.running[job] = self.client.submit(eval, CALL, {"task": task}, pure=False)

@@ -89,7 +89,7 @@ class SlurmOptions:
 
 
 class ArrayTask:
-    """What a task of the array does; submitit pickles it for its own job, by reference to this class."""
+    """The function of a task of the array; submitit pickles it for its own job, by reference to this class."""
 
     def __init__(
         self, folder: str, seeds: tuple[int, ...], epochs: int, device: str, script: Sequence[str] = ()
@@ -111,7 +111,7 @@ class ArrayTask:
             print(f"left out: {message}")
 
     def checkpoint(self) -> Any:
-        """Have the worker save and end; returns the task for submitit to put back into the queue."""
+        """Make the worker save and end; returns the task for submitit to put back into the queue."""
         import submitit
 
         if self._engine is not None:

@@ -55,9 +55,9 @@ class Pong(Single):
     ## Description
 
     The agent's paddle is on the right, the opponent's on the left. The ball flies from side to side and is reflected
-    above and below. Who misses it loses a point, and the next ball is served from the left, with both paddles in the
-    middle. The opponent follows the ball as fast as a paddle moves, 8 pixels a frame: it misses only a ball that is
-    steeper. A ball becomes steeper, by 3 pixels a frame, when the agent's paddle moves as it hits.
+    above and below. A side that misses it loses a point, and the next ball is served from the left, with both paddles
+    in the middle. The opponent follows the ball as fast as a paddle moves, 8 pixels a frame: it misses only a ball that
+    is steeper. A ball becomes steeper, by 3 pixels a frame, when the agent's paddle moves as it hits.
 
     Rules and sizes are from PufferLib's Pong (`ocean/pong/pong.h`; in its settings, `frames` is 8 and `points` 21).
     Three things are ours: `serve`, because a game from two serves can be learned by heart; the time limit; and that the

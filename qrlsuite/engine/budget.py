@@ -1,4 +1,4 @@
-"""What a command may take: `30min` of time, or `2core-hours`."""
+"""The budget of a command: `30min` of time, or `2core-hours`."""
 
 from __future__ import annotations
 

@@ -289,7 +289,7 @@ class RunDisplay:
         Parameters
         ----------
         holders:
-            Who trains the seeds that are busy: `process 12 on HOST`.
+            The processes that train the busy seeds: `process 12 on HOST`.
         """
         task, busy = self.entry.task, self.missing.busy
         self.console.print(
@@ -422,7 +422,7 @@ class RunDisplay:
 
     @property
     def _goes_on(self) -> str:
-        """What is saved of stopped training, and how it goes on."""
+        """Describe the saved part of stopped training, and how it goes on."""
         if self.entry.script is not None:
             return f"every finished seed is saved. The same {self.again} starts the others again"
         return f"every finished epoch is saved. The same {self.again} continues from there"

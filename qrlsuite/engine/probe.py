@@ -70,7 +70,7 @@ def code_of(entry: Entry) -> str:
 
 @dataclass
 class Side:
-    """What a training gave for one seed, up to the epoch after which its parameters had changed.
+    """The results of training one seed, up to the epoch after which its parameters had changed.
 
     `again` is the first difference when it was trained once more after another seed, None where it was not.
     """
@@ -186,7 +186,7 @@ def _again(side: Side, entry: Entry, seeds: Sequence[int], device: str, start: P
 
 
 def _declared(entry: Entry) -> Iterator[str]:
-    """Say what seeds have in common by declaration of plugins, for the notes of boards."""
+    """Name the things that seeds share by declaration of plugins, for the notes of boards."""
     for spec in (each.spec for each in entry.registered().values() if each.distribution != identity.OURS):
         if isinstance(spec, specs.ModelSpec) and spec.shared:
             yield f"{spec.title}: the same {', '.join(spec.shared)} at the beginning"
@@ -407,7 +407,7 @@ def _end(*given: object) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Be the fresh process; returns its exit code."""
+    """Run the fresh process; returns its exit code."""
     from qrlsuite.engine.worker import end_with
 
     answer, parent = arguments

@@ -170,7 +170,7 @@ def divided(parts: Sequence[Part], size: int) -> Iterator[list[Part]]:
 
 
 def _stop_others(claims: Sequence[Claim]) -> None:
-    """Have the other workers of the entries whose seeds are claimed here save and end; started again, they refuse."""
+    """Make the other workers of the entries whose seeds are claimed here save and end; started again, they refuse."""
     for folder in {claim.path.parent.parent for claim in claims}:
         for other in living(EntryStore(folder)):
             if other not in claims:
@@ -178,7 +178,7 @@ def _stop_others(claims: Sequence[Claim]) -> None:
 
 
 def end_with(parent: int) -> bool:
-    """Have SIGTERM sent to this process when its parent ends; returns False where it has ended already."""
+    """Let SIGTERM be sent to this process when its parent ends; returns False where it has ended already."""
     with contextlib.suppress(
         OSError, AttributeError
     ):  # elsewhere than on Linux, the heartbeat looks now and then

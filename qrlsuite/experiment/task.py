@@ -58,7 +58,7 @@ def _levels(value: Any) -> Any:
 
 @pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config={"extra": "forbid"})
 class Scale:
-    """What a good score of another program is, and how far apart the points of its curves are.
+    """The good scores of another program, and the distance between the points of its curves.
 
     Attributes
     ----------

@@ -47,7 +47,7 @@ class SeedsClaimedError(StoreError):
 
 @dataclass(frozen=True)
 class Claim:
-    """Who holds which seeds."""
+    """The holders of seeds."""
 
     path: Path
     host: str

@@ -161,7 +161,7 @@ class SameCodeRecord(Record):
 
 
 class EntryIdentity(Record):
-    """What an entry's hash covers: the task's definition, algorithm, model, their options, and `Entry.start`."""
+    """The content of an entry's hash: the task's definition, algorithm, model, their options, and `Entry.start`."""
 
     task: dict[str, Any]
     algorithm: str
@@ -172,7 +172,7 @@ class EntryIdentity(Record):
 
 
 class DeviceRecord(Record):
-    """What models were trained on."""
+    """The device that models were trained on."""
 
     kind: str = "cpu"
     name: str | None = None
@@ -311,7 +311,7 @@ def _place_of_copy(place: str) -> str:
 
 
 class EntryRecord(CodedRecord):
-    """What was run: enough to build the entry again anywhere.
+    """An entry: enough to build it again anywhere.
 
     `task_file` is the task as of the first run. `same` are its author's declarations about its codes. `plugins` has the
     places of copied plugins by path, by the digest of their code.

@@ -34,7 +34,7 @@ TRIED = {
     "algorithm": "'{} mlp' --task cartpole --quick",
     "tracker": "mlp --task beam6g --quick --track {}",
 }
-"""What follows `qrlsuite run` to try a thing, by its kind."""
+"""The words after `qrlsuite run` to try a thing, by its kind."""
 
 
 class ScaffoldError(QrlSuiteError):

@@ -506,7 +506,7 @@ class TimesRule:
 
     @property
     def promise(self) -> str:
-        """What the rule controls."""
+        """The error probability that the rule controls."""
         return (
             f"all tolerances of one pair: two entries of equal law differ significantly at any with probability "
             f"{self.alpha:g} at most; for equal means but unequal laws about so, if both have many runs; not the "
@@ -543,7 +543,7 @@ class StepsRule(TimesRule):
 
     @property
     def promise(self) -> str:
-        """What the rule controls."""
+        """The error probability that the rule controls."""
         return (
             f"mean steps of one pair: two entries of equal law differ significantly with probability {self.alpha:g} at "
             "most; for equal means but unequal laws about so, if both have many runs; not the direction, and not the "

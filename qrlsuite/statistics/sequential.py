@@ -173,7 +173,7 @@ def _simpson(low: float, high: float) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What a study claims about an entry and its rivals, at an error of its own.
+    """A study's claim about an entry and its rivals, at an error of its own.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class SequentialDesign:
-    """What a study fixes before its first run: pairs, claims, looks, and error.
+    """The facts that a study fixes before its first run: pairs, claims, looks, and error.
 
     Attributes
     ----------
@@ -351,7 +351,7 @@ class PairDecision:
     p, levels:
         p and the level it was compared with last, at each look so far.
     difference:
-        Mean steps of the second over mean steps of the first, minus 1, at the last look. After an early stop it is biased
+        The second's mean steps over the first's, minus 1, at the last look. After an early stop it is biased
         away from 0.
     interval:
         Repeated confidence interval of the difference (Jennison and Turnbull 1989). All pairs at all looks together are

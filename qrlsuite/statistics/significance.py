@@ -61,7 +61,7 @@ class Resampling:
 
 
 class Evidence:
-    """What a rule may know about one entry of a pair; computed when first asked for.
+    """The facts that a rule may use about one entry of a pair; computed at the first use.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class IntervalRule:
 
     @property
     def promise(self) -> str:
-        """What the rule controls."""
+        """The error probability that the rule controls."""
         return (
             "each cell by itself: two equal entries rarely have disjoint intervals in a given cell; "
             "the chance of a false difference somewhere on the grid grows with the number of cells"

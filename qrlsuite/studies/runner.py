@@ -58,7 +58,7 @@ class Overview(Shown):
     submitted: tuple[str, ...] = ()
 
     def now(self, where: Where) -> Overview:
-        """Return what is there and what is missing now."""
+        """Return the finished and the missing seeds now."""
         works = [find(work.runs, work.entry, where, work.seeds, work.epochs) for work in self.works]
         return replace(self, works=works)
 

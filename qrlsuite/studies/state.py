@@ -53,7 +53,7 @@ Hours = tuple[float, float]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class State(Shown):
-    """What of a study with looks is trained, and what is decided.
+    """The progress of a study with looks: its trained seeds, and its decided pairs.
 
     Attributes
     ----------
@@ -465,7 +465,7 @@ def horizon_note(outcome: State) -> str:
 
 
 def lost_note(outcome: State) -> str:
-    """Say which seeds were asked for and are not there, and that the log is gone; empty where all is there."""
+    """Name the requested seeds that are missing, and a missing log; empty where nothing is missing."""
     notes = [f"incomplete: {told} ({name})" for name, told in outcome.lost.items()]
     if outcome.begun and outcome.begun_at is None:
         notes.append("its log is missing: nobody can see when it began, or who has seen its seeds before")

@@ -83,7 +83,7 @@ class EntriesSection(Table):
 
 
 class Question(Table):
-    """What a study with looks asks, and the pairs of entries whose verdicts answer it."""
+    """A question of a study with looks, and the pairs of entries whose verdicts answer it."""
 
     text: Annotated[str, Field(min_length=1, max_length=200)]
     pairs: Annotated[list[tuple[str, str]], Field(min_length=1)]

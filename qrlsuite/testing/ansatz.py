@@ -187,7 +187,7 @@ def _effects(circuits: Circuits, grows: bool) -> None:
 
 
 def _light_cone(build: Any, options: Any, circuits: Circuits) -> str:
-    """Say what the structure of the largest circuit of up to three layers leaves without effect."""
+    """Name the parameters and inputs without effect, by the structure of the largest circuit of up to three layers."""
     largest = max(size for size in circuits if size[1] in LAYERS)
     cone = lightcone.described(circuits[largest], lambda k: cast(Circuit, build(largest[0], k, options)))
     sees = "layers_until_every_output_sees_every_input"

@@ -45,7 +45,7 @@ _watcher: ContextVar[Callable[[str | Finding], None]] = ContextVar("_watcher", d
 
 @contextlib.contextmanager
 def watching(call: Callable[[str | Finding], None]) -> Iterator[None]:
-    """Have `call` called with the name of every rule before it is checked, and with its finding then."""
+    """Let `call` be called with the name of every rule before its check, and with its finding afterwards."""
     token = _watcher.set(call)
     try:
         yield

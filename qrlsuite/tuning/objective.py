@@ -1,4 +1,4 @@
-"""What a trial is worth: the steps that it takes to learn, on the tuning seeds."""
+"""The merit of a trial: the steps that it takes to learn, on the tuning seeds."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ MOST_THREADS = 512
 """The most threads of a block, for the largest circuits."""
 
 REGISTERS = 65536 // MOST_THREADS
-"""What a thread may take of a GPU's registers, so that the most threads have room."""
+"""The registers of a GPU that a thread may take, so that the most threads have room."""
 
 
 @cache

@@ -24,10 +24,10 @@ from qrlsuite.plugins.circuits.native.cpu import KEEP_BYTES, Simulator
 from qrlsuite.plugins.circuits.native.kernels import measure, prepare, run, split, unrun, weigh
 
 NO_GRADIENTS, OF_COTANGENTS, OF_ERRORS = range(3)
-"""What `passes` differentiates: nothing, the outputs, or the squared errors of chosen outputs."""
+"""The results that `passes` differentiates: nothing, the outputs, or the squared errors of chosen outputs."""
 
 FINE, NOT_FINITE, UNCHOSEN = range(3)
-"""What it returns: expectation values may not be finite, and a choice may be no output."""
+"""Findings of `passes`: expectation values may not be finite, and a choice may be no output."""
 
 
 @inlined
@@ -174,7 +174,7 @@ def passes(
 
 
 class _Work(NamedTuple):
-    """Working memory of one chunk, V lanes; `sums` has a row for each number of a seed, `flat` those of the circuit."""
+    """Working memory of one chunk, V lanes; `sums` has a row for each number of a seed, `flat` the circuit's."""
 
     values: NDArray[Any]
     results: NDArray[Any]
@@ -195,7 +195,7 @@ class _Pass(NamedTuple):
 
 
 class _Differentiated(NamedTuple):
-    """What `passes` differentiates, and where to: by default nothing."""
+    """The results that `passes` differentiates, and where to: by default nothing."""
 
     back: int = NO_GRADIENTS
     cotangents: Array = np.empty((1, 1, 1), np.float32)

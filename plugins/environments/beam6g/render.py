@@ -34,7 +34,7 @@ _FAINT, _STRONG = 10**-4.5, 10**-0.5
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What a picture shows of an episode.
+    """A moment of an episode, as a picture shows it.
 
     Attributes
     ----------
