@@ -139,7 +139,7 @@ def test_equal_keys_do_not_change_the_number_of_labels() -> None:
 
 def test_a_level_that_would_take_hours_is_refused() -> None:
     with pytest.raises(
-        OptionError, match=r"a level of 1e-07 for each test takes 2e\+08 relabelings.*larger alpha"
+        OptionError, match=r"a level of 1e-07 for each test takes 2e\+08 permutations.*larger alpha"
     ):
         relabelings_for(1e-7)
 
