@@ -92,7 +92,7 @@ def test_runs_end_as_they_did(
         entry = EntryStore(folder).entry()
         missing.settle_codes(tmp_path, [entry], Where.create())
         assert missing.find(tmp_path, entry, Where.create()).store.mark
-        assert capsys.readouterr().err.count(f"{changes[0]}. Begun anew is '") == 1
+        assert capsys.readouterr().err.count(f"{changes[0]}. Training starts over as '") == 1
         return
     train_group(folder, SEEDS, EPOCHS)
     same_bits = stored(version, "machine") == machine() and not changes
