@@ -134,8 +134,7 @@ class AcrossSection:
         return [
             "mean: mean over tasks of the mean over seeds, less is better; IQM: mean of the middle half of all runs; "
             "intervals: bootstrap of runs within tasks, of each entry by itself",
-            "P: probability that a run needs less than a run of the next entry, mean over tasks, ties one "
-            "half",
+            "P: probability that a run needs less than a run of the next entry, mean over tasks, ties one half",
             "needs less, needs more: runs permuted within tasks, Holm over all pairs: error probability "
             f"{self.alpha:g} for all together",
         ]

@@ -192,10 +192,9 @@ def ranks(section: Section) -> list[Column[Row]]:
     return [
         ranks_column(
             lambda row: None if row.time.ranks is None else list(row.time.ranks),
-            meaning="1 + the number of entries that outperform this one, to the last that the decided "
-            "pairs leave. A outperforms B if it needs significantly fewer steps, as a mean over "
-            "the thresholds (permutation tests, Holm's correction over all pairs of the board, "
-            "shown or not)",
+            meaning="1 + the number of entries that outperform this one, to the last that the decided pairs leave. A "
+            "outperforms B if it needs significantly fewer steps, as a mean over the thresholds (permutation "
+            "tests, Holm's correction over all pairs of the board, shown or not)",
             hover=lambda row: unranked_since(row.entry) if row.time.ranks is None else "",
         ),
         _name(section),

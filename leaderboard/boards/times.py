@@ -114,8 +114,7 @@ class TimeRanking:
         """Name every pair whose decision more relabelings could turn."""
         return [
             f"within Monte Carlo error of its level after 10 million permutations: {self._label(i)} and "
-            f"{self._label(j)}, adjusted p = {p_text(self.board.adjusted[i, j])} +- "
-            f"{self.board.p_error[i, j]:.1g}"
+            f"{self._label(j)}, adjusted p = {p_text(self.board.adjusted[i, j])} +- {self.board.p_error[i, j]:.1g}"
             for place, i in enumerate(self.order)
             for j in self.order[place + 1 :]
             if self.board.p_error[i, j]

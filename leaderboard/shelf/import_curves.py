@@ -316,9 +316,8 @@ def _scores(
         )
         levels = "thresholds=" + ",".join(f"{part * (best or max(high, 1)):g}" for part in (0.6, 0.75, 0.9))
         raise FileError(
-            f"{source}: '{run[0]}', seed {run[1]}: the score at step {every * (worst + 1)} is "
-            f"{curve[worst]:g}, and scores are not between 0 and {top}. A new --task takes any scores: "
-            f"leave maximum out, and type {levels}"
+            f"{source}: '{run[0]}', seed {run[1]}: the score at step {every * (worst + 1)} is {curve[worst]:g}, and "
+            f"scores are not between 0 and {top}. A new --task takes any scores: leave maximum out, and type {levels}"
         ) from None
     return scores
 

@@ -131,18 +131,12 @@ class PPOOptions:
     ] = 0.0
     value_clip: Annotated[
         float | None,
-        Field(
-            gt=0,
-            description="values stop learning at this distance from the collected ones; absent: no limit",
-        ),
+        Field(gt=0, description="distance from the collected values where learning stops; absent: none"),
         Since("0.2.0"),
     ] = None
     longest_gradient: Annotated[
         float | None,
-        Field(
-            gt=0,
-            description="longest norm of an agent's gradient; longer ones are scaled down; absent: no limit",
-        ),
+        Field(gt=0, description="norm to which longer gradients of an agent are scaled down; absent: none"),
         Since("0.2.0"),
     ] = None
     decay_steps: DecaySteps = None

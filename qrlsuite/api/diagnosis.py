@@ -187,9 +187,8 @@ class CircuitDiagnosis(Shown):
             (*heads, "local", "5% to 95%", "global", "5% to 95%"),
             rows,
             (
-                "of a derivative by a parameter, mean over the parameters that have an effect; "
-                f"{self.draws} draws; local: Z of qubit 0, global: product of all Z; interval: bootstrap "
-                "over draws",
+                f"of a derivative by a parameter, mean over the parameters that have an effect; {self.draws} draws; "
+                "local: Z of qubit 0, global: product of all Z; interval: bootstrap over draws",
                 "\n".join(laws),
             )[: 1 + bool(laws)],
         )

@@ -294,7 +294,6 @@ def _one_task(stores: Sequence[EntryStore]) -> None:
     tasks = {record.task_hash: record.task_name for record in (store.record() for store in stores)}
     if len(tasks) > 1:
         raise OptionError(
-            f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes "
-            "and sums cannot be compared: evaluate them one by one, or name the task that all play: --task "
-            "TASK"
+            f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes and sums "
+            "cannot be compared: evaluate them one by one, or name the task that all play: --task TASK"
         )

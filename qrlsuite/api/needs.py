@@ -137,9 +137,8 @@ def power(
     grid = ranked.ranking_of(entries).grid
     if mean_time(curves[0], grid).at_cap.min() == 1:
         raise OptionError(
-            f"no seed of '{entries[0].label}' reached a threshold within {horizon} steps, so no slower "
-            "entry can be simulated: train longer, change the task's thresholds, or name another entry "
-            "first"
+            f"no seed of '{entries[0].label}' reached a threshold within {horizon} steps, so no slower entry can be "
+            "simulated: train longer, change the task's thresholds, or name another entry first"
         )
     per_pair = _core_hours(entries, horizon // curves[0].steps_per_epoch)
     console = Console(stderr=True, quiet=not progress, highlight=False)

@@ -169,8 +169,7 @@ def train_entry(
     if entry.script is not None:
         if track or start is not None or where.device != "cpu":
             raise OptionError(
-                f"'{entry.label}': the script itself handles trackers, --device and --from: write them in "
-                "its command"
+                f"'{entry.label}': the script itself handles trackers, --device and --from: write them in its command"
             )
         entry = entry if epochs is None else entry.for_epochs(epochs)
     seed_numbers = None if seeds is None else read_seeds(seeds)

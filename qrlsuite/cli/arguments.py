@@ -94,8 +94,7 @@ RuleOption = Annotated[
     typer.Option(
         "--rule",
         metavar="NAME",
-        help="Also judge the cells of the task's grid by this rule: paper, or a name of `qrlsuite list "
-        "rules`.",
+        help="Also judge the cells of the task's grid by this rule: paper, or a name of `qrlsuite list rules`.",
     ),
 ]
 AlphaOption = Annotated[

@@ -397,8 +397,7 @@ class RunDisplay:
             self._advised, self.endless = True, left > DAY
             if left > 3600:
                 self._say(
-                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; every trained seed "
-                    "counts"
+                    "faster: fewer --seeds or --epochs, or --engine slurm on a cluster; every trained seed counts"
                 )
 
     def close(self) -> None:

@@ -204,8 +204,7 @@ class _Run:
         scores = settled(values / best)
         if self.file.ranking.thresholds is None and not ((scores > -1e-6) & (scores < 1 + 1e-6)).all():
             raise QrlSuiteError(
-                f"{self.name}: its scores go from {values.min():g} to {values.max():g}, the task's from 0 "
-                f"to {best:g}"
+                f"{self.name}: its scores go from {values.min():g} to {values.max():g}, the task's from 0 to {best:g}"
             )
         return scores
 

@@ -203,8 +203,7 @@ class Study:
                 common = range(max(block.start, own.start), min(block.stop, own.stop))
                 if common and (shared or log.parent == self.folder):
                     yield (
-                        f"study {plan} has seen these seeds ({log}), and their results may have shaped "
-                        "this study"
+                        f"study {plan} has seen these seeds ({log}), and their results may have shaped this study"
                     )
 
     def _next_block(self) -> int:
@@ -232,9 +231,8 @@ class Study:
             store = EntryStore.find(self.folder, entry)
             if not store.seeds() and _has_other_code(table, entry):
                 raise OptionError(
-                    f"{self.source}: the code of '{name}' has changed since the study was written, and the "
-                    "study's hash covers it: restore that code, or write another study with `qrlsuite "
-                    "study new`"
+                    f"{self.source}: the code of '{name}' has changed since the study was written, and the study's "
+                    "hash covers it: restore that code, or write another study with `qrlsuite study new`"
                 )
 
     def end(self) -> None:

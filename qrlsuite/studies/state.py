@@ -458,9 +458,8 @@ def horizon_note(outcome: State) -> str:
     if not any(map(outcome.late, outcome.pairs)):
         return ""
     return (
-        f"at the horizon: both entries are {outcome.study.grid.before} the thresholds for {NEAR:.0%} or "
-        "more of the steps. Such a verdict means little: neither had time to learn. A study with more "
-        "epochs may decide"
+        f"at the horizon: both entries are {outcome.study.grid.before} the thresholds for {NEAR:.0%} or more of the "
+        "steps. Such a verdict means little: neither had time to learn. A study with more epochs may decide"
     )
 
 

@@ -182,8 +182,7 @@ class StudiesTogether(Shown):
         )
         if len(self.studies) >= DRAWN:
             yield Text(
-                "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at "
-                "random."
+                "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at random."
             )
         alpha = max(each.study.looks.alpha for each in self.studies)
         for claim, tasks in self.claims.items():

@@ -54,9 +54,8 @@ def tuning_seeds(requested: int | str | Iterable[int]) -> tuple[int, ...]:
         return tuple(TUNING_SEEDS + seed for seed in seeds)
     if seeds[0] < TUNING_SEEDS:
         raise OptionError(
-            f"--seeds {requested}: tuning uses seeds from {TUNING_SEEDS} up, so that no settings are judged "
-            f"by the runs that chose them; write --seeds {len(seeds)} for {TUNING_SEEDS} to "
-            f"{TUNING_SEEDS + len(seeds) - 1}"
+            f"--seeds {requested}: tuning uses seeds from {TUNING_SEEDS} up, so that no settings are judged by the "
+            f"runs that chose them; write --seeds {len(seeds)} for {TUNING_SEEDS} to {TUNING_SEEDS + len(seeds) - 1}"
         )
     return seeds
 

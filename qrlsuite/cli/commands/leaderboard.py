@@ -68,8 +68,7 @@ def leaderboard(
         typer.Option(
             "--rule",
             metavar="NAME",
-            help="Show tiers by cells of the grid instead of ranks: paper, or a name of `qrlsuite list "
-            "rules`.",
+            help="Show tiers by cells of the grid instead of ranks: paper, or a name of `qrlsuite list rules`.",
         ),
     ] = None,
     alpha: AlphaOption = ALPHA,

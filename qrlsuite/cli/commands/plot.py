@@ -57,9 +57,8 @@ def plot(
         list[str] | None,
         typer.Option(
             "--study",
-            help="A picture that this study names, or a picture of its entries; `pairs` and `entries`, "
-            "too, if it has looks. Repeat it for the pairs that several studies with looks compare, "
-            "each on another task.",
+            help="A picture that this study names, or a picture of its entries; `pairs` and `entries`, too, if it "
+            "has looks. Repeat it for the pairs that several studies with looks compare, each on another task.",
         ),
     ] = None,
     horizon: HorizonOption = None,

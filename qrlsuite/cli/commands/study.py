@@ -54,9 +54,8 @@ WordsArgument = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="WORD|OPTION=VALUE",
-        help="Only entries with one of these words in group, label or task, or with this name. qubits=6 "
-        "sets an option wherever an entry has it; vqc-native=vqc-pennylane replaces a model by "
-        "another.",
+        help="Only entries with one of these words in group, label or task, or with this name. qubits=6 sets an "
+        "option wherever an entry has it; vqc-native=vqc-pennylane replaces a model by another.",
     ),
 ]
 
