@@ -38,15 +38,16 @@ test-long: install-dev
 breaks: install-dev
 	$(BIN)/python tests/breaks.py
 
-# The lowest versions that pyproject.toml allows, in an environment of its own: the tests of the commands, of what is on
-# disk and of circuits exported to PennyLane and Qiskit. Warnings of old versions about each other are no errors here.
+# The lowest versions that pyproject.toml allows and that have wheels for this Python, in an environment of its own: the
+# tests of the commands, of what is on disk and of circuits exported to PennyLane and Qiskit. Warnings of old versions
+# about each other are no errors here.
 LOWEST := tests/cli/test_cli.py tests/core/test_options.py tests/core/test_parquet.py tests/core/test_store.py \
   tests/circuits/test_export.py
 test-lowest:
 	$(PYTHON) -m venv $(VENV)-lowest
 	$(VENV)-lowest/bin/pip install --quiet uv
 	$(VENV)-lowest/bin/uv pip install --quiet --python $(VENV)-lowest/bin/python --resolution lowest-direct \
-	  --torch-backend cpu --editable . 'pytest>=8.2' 'hypothesis>=6.100' 'qiskit-qasm3-import>=0.6'
+	  --only-binary :all: --torch-backend cpu --editable . 'pytest>=8.2' 'hypothesis>=6.100' 'qiskit-qasm3-import>=0.6'
 	$(VENV)-lowest/bin/python -m pytest -q -W default $(LOWEST) -k 'not what_comes_next'
 
 # Published entries and studies in which this checkout differs from BASE: hashes, files, and RERUN seeds of each entry
@@ -94,17 +95,27 @@ pictures: install-dev
 statements: install-dev
 	$(BIN)/python docs/statements.py
 
-# What a release publishes; and what a user gets of it, who has no clone.
+# What a release publishes; and what a user gets of it, who has no clone: an empty folder and some curves.
 dist: $(BIN)/python
 	rm -rf dist
-	$(BIN)/pip install --quiet build
+	$(BIN)/pip install --quiet build twine
 	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+FROM_WHEEL := cd $(VENV)-wheel/elsewhere && exec ../bin/qrlsuite
 demo-of-wheel: dist
 	$(MAKE) $(VENV)-wheel/bin/python VENV=$(VENV)-wheel
 	$(VENV)-wheel/bin/pip install --quiet --force-reinstall --no-deps dist/*.whl
 	$(VENV)-wheel/bin/pip install --quiet dist/*.whl
-	mkdir -p $(VENV)-wheel/elsewhere
-	cd $(VENV)-wheel/elsewhere && ../bin/qrlsuite demo
+	rm -rf $(VENV)-wheel/elsewhere
+	mkdir $(VENV)-wheel/elsewhere
+	cp docs/tutorials/data/racetraq_chicane_4q.csv $(VENV)-wheel/elsewhere/curves.csv
+	$(FROM_WHEEL) demo
+	$(FROM_WHEEL) import curves.csv metric=lapped_share maximum=1
+	$(FROM_WHEEL) leaderboard --published --task beam6g
+	$(FROM_WHEEL) run --task beam6g --model vqc-pennylane --quick
+	$(FROM_WHEEL) view --port 8765 & \
+	  curl --silent --fail --retry 60 --retry-delay 1 --retry-connrefused --output /dev/null http://127.0.0.1:8765; \
+	  shown=$$?; kill $$!; exit $$shown
 
 # By uv, which takes a sixth of pip's processor time and shows what it downloads; by pip where uv does not find all of it:
 # it does not read pip's settings, an index of your own for example.

@@ -18,11 +18,11 @@ import pytest
 from tests.commands import Command, qrlsuite
 from tests.conftest import HANGS
 from tests.docs.test_plugins import PAGES
+from tests.docs.test_release import SUITE
 
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
-SUITE = ("pyproject.toml", "README.md", "LICENSE", "qrlsuite", "plugins", "tasks", "leaderboard")
 TINY = ("--seeds", "1", "--epochs", "1", "--workers", "1")
 PIP = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
 
