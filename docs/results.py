@@ -73,7 +73,9 @@ def judged(name: str) -> tuple[str, str]:
 
 
 def _folded(title: str, text: str) -> str:
-    return f'<details markdown="1"><summary>{title}</summary>\n\n{text}\n\n</details>' if text else ""
+    name = "-".join(title.lower().split())
+    head = f'<details id="{name}" markdown="1"><summary>{title}</summary>'
+    return f"{head}\n\n{text}\n\n</details>" if text else ""
 
 
 def _page(title: str, *blocks: str) -> str:

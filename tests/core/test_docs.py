@@ -277,8 +277,17 @@ def test_the_fidelity_pages_options_exist() -> None:
 
 def test_links_between_pages_resolve() -> None:
     for page in PAGES:
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+        for target, place in re.findall(r"\]\(([^)#:]+)(?:#([^)]*))?\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+            assert not place or place in places(page.parent / target), f"{page.name} links to {target}#{place}"
+
+
+def places(page: Path) -> set[str]:
+    """Return the names of a page's headings and folds in its address, as GitHub and mkdocs make them."""
+    heads = re.findall(r"^#+ (.*)", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads} | {
+        *re.findall(r'<details id="([\w-]+)"', page.read_text())
+    }
 
 
 def sections(docstring: str | None) -> dict[str, list[str]]:
