@@ -279,7 +279,9 @@ def test_links_between_pages_resolve() -> None:
     for page in PAGES:
         for target, place in re.findall(r"\]\(([^)#:]+)(?:#([^)]*))?\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
-            assert not place or place in places(page.parent / target), f"{page.name} links to {target}#{place}"
+            assert not place or place in places(page.parent / target), (
+                f"{page.name} links to {target}#{place}"
+            )
 
 
 def places(page: Path) -> set[str]:
