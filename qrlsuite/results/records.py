@@ -24,10 +24,10 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
-    ModelWrapValidatorHandler,
     PrivateAttr,
     model_validator,
 )
+from pydantic.functional_validators import ModelWrapValidatorHandler
 
 from qrlsuite import files, notation, options, registry, specs
 from qrlsuite.errors import StoreError
