@@ -60,8 +60,7 @@ def test_what_an_index_shows_leads_somewhere_or_is_plain_text(
     address: str | None, sources: Path, tmp_path: Path
 ) -> None:
     renderer = pytest.importorskip("readme_renderer.markdown", reason="pip install '.[dev]'")
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert "\nrepository-code:" not in citation, "an address: this test may begin with it, and None goes"
+    citation = re.sub(r"^repository-code:.*\n", "", (ROOT / "CITATION.cff").read_text(), flags=re.MULTILINE)
     (sources / "CITATION.cff").write_text(citation + (f'repository-code: "{address}/"\n' if address else ""))
     setuptools("prepare_metadata_for_build_wheel", sources, tmp_path)
     made = BytesParser().parsebytes(next(tmp_path.glob("*/METADATA")).read_bytes())
