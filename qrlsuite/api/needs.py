@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards import ranked
-from qrlsuite.leaderboard.shelf.collect import Selection, collect, read_entry
+from qrlsuite.leaderboard.shelf.collect import Selection, collect, read, read_entry
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import hours_text
@@ -193,8 +194,11 @@ class StudyPower:
 def study_power(study: Study) -> StudyPower | None:
     """Return a study's power, from seeds that are searched, stored or published; None where its task has too few."""
     keys = {(entry.task.name, entry.name) for entry in study.entries.values()}
-    searches = [EntryStore(study.runs / FOLDER / task / name) for task, name in sorted(keys)]
-    own = [read_entry(store, tuning=True) for store in searches if store.path.is_dir()]
+    places = [Path(task, name) for task, name in sorted(keys)]
+    trained = [EntryStore(study.folder / place) for place in places]
+    searched = [EntryStore(study.runs / FOLDER / place) for place in places]
+    own = [read(store) for store in trained if store.path.is_dir()]
+    own += [read_entry(store, tuning=True) for store in searched if store.path.is_dir()]
     own += collect(Selection(study.runs, published=True, only=keys))[0]
     pilots = _spreads(filter(None, own), study) or _spreads(
         collect(Selection(study.runs, published=True, tasks=(study.task,)))[0], study

@@ -91,6 +91,20 @@ def test_one_size_on_several_tasks() -> None:
     assert "The mean over the tasks [decides nothing]" in FINDINGS
 
 
+def test_a_larger_study_tells_the_circuit_on_cartpole_from_its_control() -> None:
+    found = {pair.second: pair for pair in tables.published("advantage-cartpole").pairs}
+    assert {name: pair.verdict for name, pair in found.items()} == {
+        "mean-field": "circuit needs fewer",
+        "network": "circuit needs fewer",
+        "sines": "sines needs fewer",
+    }
+    said = [f"{abs(found[name].difference):.0%}" for name in ("mean-field", "network", "sines")]
+    assert said == ["13%", "10%", "22%"]
+    assert found["mean-field"].n_runs == found["sines"].n_runs == 200
+    assert "the control needs 13% more steps than the circuit, and sines need 22% fewer." in README
+    assert "needs 13% more steps than the circuit, the network needs 10% more, and sines need 22% fewer." in FINDINGS
+
+
 def test_a_larger_batch_takes_a_third_of_the_steps() -> None:
     pairs = {(pair.first, pair.second): pair.difference for pair in tables.published("larger-batch").pairs}
     assert all(2 < pairs[name, f"{name}, batch 64"] < 2.5 for name in ("6 qubits", "width 10"))
