@@ -102,7 +102,10 @@ def test_a_larger_study_tells_the_circuit_on_cartpole_from_its_control() -> None
     assert said == ["13%", "10%", "22%"]
     assert found["mean-field"].n_runs == found["sines"].n_runs == 200
     assert "the control needs 13% more steps than the circuit, and sines need 22% fewer." in README
-    assert "needs 13% more steps than the circuit, the network needs 10% more, and sines need 22% fewer." in FINDINGS
+    assert (
+        "needs 13% more steps than the circuit, the network needs 10% more, and sines need 22% fewer."
+        in FINDINGS
+    )
 
 
 def test_a_larger_batch_takes_a_third_of_the_steps() -> None:
