@@ -49,7 +49,7 @@ def demo(runs: RunsOption = Path("runs")) -> None:
     for first, second in combinations(trained, 2):
         typer.echo(f"- {api.compare(first, second).pair.said}")
     typer.echo(
-        "Next, a circuit of your own: write it in swirl.py, as docs/your-circuit.md does, and add --plugin swirl.py"
+        "Next, a circuit of your own: put a QNode into mine.py, and type: qrlsuite check mine.py --plugin mine.py"
     )
 
 
