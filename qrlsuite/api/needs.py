@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from rich.text import Text
 from qrlsuite.api.entries import load
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard.boards import ranked
 from qrlsuite.leaderboard.shelf.collect import Selection, collect, read, read_entry
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -193,16 +193,8 @@ class StudyPower:
 
 def study_power(study: Study) -> StudyPower | None:
     """Return a study's power, from seeds that are searched, stored or published; None where its task has too few."""
-    keys = {(entry.task.name, entry.name) for entry in study.entries.values()}
-    places = [Path(task, name) for task, name in sorted(keys)]
-    trained = [EntryStore(study.folder / place) for place in places]
-    searched = [EntryStore(study.runs / FOLDER / place) for place in places]
-    own = [read(store) for store in trained if store.path.is_dir()]
-    own += [read_entry(store, tuning=True) for store in searched if store.path.is_dir()]
-    own += collect(Selection(study.runs, published=True, only=keys))[0]
-    pilots = _spreads(filter(None, own), study) or _spreads(
-        collect(Selection(study.runs, published=True, tasks=(study.task,)))[0], study
-    )
+    published = Selection(study.runs, published=True, tasks=(study.task,))
+    pilots = _spreads(_own(study), study) or _spreads(collect(published)[0], study)
     if not pilots:
         return None
     spread, pilot = pilots[len(pilots) // 2]
@@ -217,6 +209,20 @@ def study_power(study: Study) -> StudyPower | None:
         for lead in (SLOWER if claim.at_most is None else (0.0,))
     }
     return StudyPower(found, spread, pilot.label, len(pilot.seeds), claims)
+
+
+def _own(study: Study) -> Iterator[EntryResults]:
+    """Return what can be read of a study's entries: in its own folder, in searches, and among the others."""
+    keys = {(entry.task.name, entry.name) for entry in study.entries.values()}
+    for folder, reading in (
+        (study.folder, read),
+        (study.runs / FOLDER, functools.partial(read_entry, tuning=True)),
+    ):
+        for store in (EntryStore(folder / task / name) for task, name in sorted(keys)):
+            with contextlib.suppress(QrlSuiteError):  # a damaged one says nothing of a spread
+                if store.path.is_dir() and (found := reading(store)) is not None:
+                    yield found
+    yield from collect(Selection(study.runs, published=True, only=keys))[0]
 
 
 def _spreads(entries: Iterable[EntryResults], study: Study) -> list[tuple[float, EntryResults]]:

@@ -368,9 +368,8 @@ def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str, metric
         raise FileError(
             f"{source}, {place}: {texts}: seed and step are whole numbers, and the score is a number"
         ) from None
-    name = re.sub(
-        rf"__{numbers[0]}__\d{{9,}}$", "", str(entry).strip()
-    )  # CleanRL's run: its seed, and when it began
+    # CleanRL's run ends with its seed and the second when it began.
+    name = re.sub(rf"__{numbers[0]}__\d{{9,}}$", "", str(entry).strip())
     rows.add(name, *numbers, source, metric)
 
 

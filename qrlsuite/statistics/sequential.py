@@ -1,10 +1,11 @@
-"""Sequential designs: several looks at growing numbers of runs, with one error probability for all looks. Someone who
-looks at the data again and again and stops at the first p below .05 errs far more often than that. Here alpha is spent
-over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70), and over the pairs by a
-group-sequential Holm procedure (Maurer and Bretz 2013, Statistics in Biopharmaceutical Research 5; Ye, Li, Liu and Yao
-2013, Statistics in Medicine 32): every pair that is not yet decided is tested at the levels that belong to alpha /
-number of such pairs, and after a rejection again with one less. The family is all pairs that were planned. A pair that
-is closed as equal is not rejected: it keeps its share of alpha.
+"""Sequential designs: several looks at growing numbers of runs, with one error probability for all looks.
+
+Someone who looks at the data again and again and stops at the first p below .05 errs in far more than 5 percent of
+cases. Here alpha is spent over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70),
+and over the pairs by a group-sequential Holm procedure (Maurer and Bretz 2013, Statistics in Biopharmaceutical Research
+5; Ye, Li, Liu and Yao 2013, Statistics in Medicine 32): every pair that is not yet decided is tested at the levels that
+belong to alpha / number of such pairs, and after a rejection again with one less. The family is all pairs that were
+planned. A pair that is closed as equal is not rejected: it keeps its share of alpha.
 
 The test is the test of rule `steps` or `times` (`MaxT`); labels are exchanged within the block of seeds that each look
 added. By `steps`, relabelings of a look go on until no decision can turn.
