@@ -157,6 +157,10 @@ PICTURES: dict[str, Picture] = {
         "--study equal-size-cartpole --study equal-size-frozenlake --study equal-size-vqe-h2 --study equal-size-pulse",
         ("plans/equal-size-*", "plans/equal-size-*/*/*"),
     ),
+    "study-advantage-tasks.png": Plot(
+        "plot pairs --study advantage-cartpole --study advantage-vqe-h2",
+        ("plans/advantage-*", "plans/advantage-*/*/*"),
+    ),
     "study-equal-size-ppo-tasks.png": Plot(
         "plot pairs --study equal-size-beam6g-ppo --study equal-size-cartpole-ppo",
         ("plans/equal-size-*-ppo", "plans/equal-size-*-ppo/*/*"),

@@ -30,6 +30,7 @@ from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.text import hours_text
 from qrlsuite.studies.state import State
+from qrlsuite.studies.together import together
 
 PAGES = ROOT / "docs" / "results"
 JUDGMENTS = ROOT / "leaderboard" / "judgments"
@@ -37,6 +38,7 @@ MOST = 120
 """Words of a judgment."""
 BOARDS = ("beam6g", *PAIRS)
 TOGETHER: Mapping[str, tuple[str, ...]] = {
+    "advantage": ("advantage-cartpole", "advantage-vqe-h2"),
     "equal-size": tuple(
         f"equal-size-{task}"
         for task in ("beam6g", "beam6g-degree5", "beam6g-a3-0", "cartpole", "frozenlake", "vqe-h2", "pulse")
@@ -209,6 +211,10 @@ def of_tasks(name: str) -> str:
         _code(f"qrlsuite show {' '.join(members)}"),
         f"Steps below threshold, mean over seeds and thresholds:\n\n{markdown(shared)}" if shared else "",
         f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several('+'.join(members)))}",
+        *(
+            f"Claim: {claim}. Established on {', '.join(found) or 'none'}: by all looks, error .05 over the tasks."
+            for claim, found in together([published(each) for each in members]).claims.items()
+        ),
         _folded("Notes", notes),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -91,21 +92,20 @@ def test_one_size_on_several_tasks() -> None:
     assert "The mean over the tasks [decides nothing]" in FINDINGS
 
 
-def test_a_larger_study_tells_the_circuit_on_cartpole_from_its_control() -> None:
-    found = {pair.second: pair for pair in tables.published("advantage-cartpole").pairs}
-    assert {name: pair.verdict for name, pair in found.items()} == {
-        "mean-field": "circuit needs fewer",
-        "network": "circuit needs fewer",
-        "sines": "sines needs fewer",
-    }
-    said = [f"{abs(found[name].difference):.0%}" for name in ("mean-field", "network", "sines")]
-    assert said == ["13%", "10%", "22%"]
-    assert found["mean-field"].n_runs == found["sines"].n_runs == 200
-    assert "the control needs 13% more steps than the circuit, and sines need 22% fewer." in README
-    assert (
-        "needs 13% more steps than the circuit, the network needs 10% more, and sines need 22% fewer."
-        in FINDINGS
-    )
+@pytest.mark.parametrize(
+    ("task", "seeds", "more"),
+    [("cartpole", (200, 400, 200), (13, 10, -22)), ("vqe-h2", (400, 100, 100), (9, 23, -15))],
+)
+def test_larger_studies_decide_every_pair(task: str, seeds: Sequence[int], more: Sequence[int]) -> None:
+    found = {pair.second: pair for pair in tables.published(f"advantage-{task}").pairs}
+    mean_field, network, sines = (found[name] for name in ("mean-field", "network", "sines"))
+    assert [mean_field.verdict, network.verdict] == ["circuit needs fewer"] * 2
+    assert sines.verdict == "sines needs fewer"
+    assert tuple(pair.n_runs for pair in (mean_field, network, sines)) == seeds
+    assert tuple(round(100 * pair.difference) for pair in (mean_field, network, sines)) == more
+    for page in (README, FINDINGS):
+        assert "needs 13% and 9% more steps than the circuit" in page
+        assert "sines need 22% and 15% fewer." in page
 
 
 def test_a_larger_batch_takes_a_third_of_the_steps() -> None:
