@@ -211,10 +211,7 @@ def of_tasks(name: str) -> str:
         _code(f"qrlsuite show {' '.join(members)}"),
         f"Steps below threshold, mean over seeds and thresholds:\n\n{markdown(shared)}" if shared else "",
         f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several('+'.join(members)))}",
-        *(
-            f"Claim: {claim}. Established on {', '.join(found) or 'none'}: by all looks, error .05 over the tasks."
-            for claim, found in together([published(each) for each in members]).claims.items()
-        ),
+        "\n".join(f"- {line}" for line in together([published(each) for each in members]).claim_lines),
         _folded("Notes", notes),
     )
 

@@ -621,7 +621,7 @@ _TOLERANCE = 1e-6  # a mean of scores in [0, 1] may leave it by rounding
 
 
 def _tuned_text(tuning: Mapping[str, Any]) -> str:
-    """Return the budget of tuning as far as it is known: `tuned (24 trials, 32 seeds, regret 5%)`."""
+    """Return the known parts of the tuning budget: `tuned (24 trials, 32 seeds, regret 5%)`."""
     known = [counted(int(tuning["trials"]), "trial")] if tuning.get("trials") is not None else []
     if isinstance(tuning.get("seeds"), str):
         with contextlib.suppress(OptionError):  # text of another suite, which a record may hold

@@ -30,7 +30,7 @@ PUBLISHED = PLANS
 
 
 def names(begun: bool = False) -> list[str]:
-    """Return the names of the studies that come with the suite: all, or only those that have taken a look."""
+    """Return the names of the studies that come with the suite: all, or only the ones with a look."""
     return sorted(path.parent.name for path in PUBLISHED.glob(f"*/{LOG if begun else FILE}"))
 
 

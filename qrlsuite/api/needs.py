@@ -212,14 +212,14 @@ def study_power(study: Study) -> StudyPower | None:
 
 
 def _own(study: Study) -> Iterator[EntryResults]:
-    """Return what can be read of a study's entries: in its own folder, in searches, and among the others."""
+    """Return the readable results of a study's entries: in its own folder, in searches, and on boards."""
     keys = {(entry.task.name, entry.name) for entry in study.entries.values()}
     for folder, reading in (
         (study.folder, read),
         (study.runs / FOLDER, functools.partial(read_entry, tuning=True)),
     ):
         for store in (EntryStore(folder / task / name) for task, name in sorted(keys)):
-            with contextlib.suppress(QrlSuiteError):  # a damaged one says nothing of a spread
+            with contextlib.suppress(QrlSuiteError):  # a damaged entry has no spread
                 if store.path.is_dir() and (found := reading(store)) is not None:
                     yield found
     yield from collect(Selection(study.runs, published=True, only=keys))[0]

@@ -280,7 +280,7 @@ class RunDisplay:
         self._last: dict[str, dict[str, Any]] = {}
 
     def _say(self, text: str) -> None:
-        """Print a sentence as it is, on one line."""
+        """Print a sentence without markup, on one line."""
         self.console.print(text, markup=False, soft_wrap=True)
 
     def begin(self, submits: bool = False, holders: Sequence[str] = ()) -> None:

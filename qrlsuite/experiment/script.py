@@ -86,7 +86,7 @@ class Script(Scale):
 
     @property
     def scores(self) -> str:
-        """The kind of the scores: as it is stated, else by their name, which some files have for themselves."""
+        """The stated kind of the scores, else the kind that their name or the file's name implies."""
         files = {".npz": "eval/", "monitor.csv": "rollout/"}
         own = next((name for end, name in files.items() if self.curve.endswith(end)), "")
         return self.kind or kind_of(self.metric or own)

@@ -89,7 +89,7 @@ def change(store: EntryStore, current: CodeIdentity) -> str:
 
 
 def linked(record: EntryRecord, digests: Iterable[str]) -> tuple[str, ...]:
-    """Return digests of codes, and those that `--same` links to them."""
+    """Return digests of codes, and the digests that `--same` links to them."""
     found = dict.fromkeys(digests)
     for link in record.same_codes:
         if not found.keys().isdisjoint(link):

@@ -621,7 +621,7 @@ def _lines(
 
 
 def _seen(line: LookLine, curves: Mapping[str, LearningCurves]) -> str:
-    """Return the digest of the curves that a look sees, of those that are there."""
+    """Return the digest of the curves that a look sees; missing curves are left out."""
     names = {name for pair in line.pairs for name in pair.pair}
     names |= {name for claim in line.claims for name in (claim.entry, *claim.rivals)}
     return digest({name: curves[name].values[: line.look].tolist() for name in names & {*curves}})

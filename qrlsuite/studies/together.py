@@ -166,6 +166,16 @@ class StudiesTogether(Shown):
             ),
         }
 
+    @property
+    def claim_lines(self) -> list[str]:
+        """A sentence for each claim, with the tasks on which it holds."""
+        alpha = max(each.study.looks.alpha for each in self.studies)
+        return [
+            f"claim: {claim}: established on {', '.join(tasks) or 'none'} (by all looks; error {alpha:g} over the "
+            "tasks, Holm)"
+            for claim, tasks in self.claims.items()
+        ]
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show a table for each question, with explanations."""
         names = ", ".join(each.study.name for each in self.studies)
@@ -184,10 +194,7 @@ class StudiesTogether(Shown):
             yield Text(
                 "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at random."
             )
-        alpha = max(each.study.looks.alpha for each in self.studies)
-        for claim, tasks in self.claims.items():
-            where = f"established on {', '.join(tasks) or 'none'}"
-            yield Text(f"claim: {claim}: {where} (by all looks; error {alpha:g} over the tasks, Holm)")
+        yield from map(Text, self.claim_lines)
         yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
             yield Text(f"entries with other options on another task: {', '.join(self.changed)}")

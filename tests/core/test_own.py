@@ -389,7 +389,7 @@ def test_an_edited_file_takes_its_own_place_and_a_broken_one_does_not() -> None:
 
 
 def test_what_is_loaded_is_what_was_read() -> None:
-    """The identity, too, is that of the code which runs, whatever becomes of the file."""
+    """The identity also describes the loaded code, even if the file changes later."""
     own.load(write("all_of_it.py", ALL))
     entry = resolve("beam6g", "http-net2")
     before = identity.of(entry).digest

@@ -31,7 +31,7 @@ ADDRESS = "https://example.org/qrlsuite"
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of what wheels are built from, for building leaves files beside it."""
+    """A copy of the sources of a wheel, because a build leaves files beside them."""
     folder = tmp_path_factory.mktemp("suite")
     for name in SUITE:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy

@@ -244,7 +244,7 @@ def test_normalizations_that_cannot_be(given: dict[str, Any], message: str) -> N
 
 
 def test_some_values_alone_are_shown() -> None:
-    """CartPole's position and angle, the other way round; states and normalization are those of what is shown."""
+    """CartPole's position and angle, in reverse order; states and normalization are of the shown values."""
     whole, some = lanes("CartPole-v1", 3), GymLanes("CartPole-v1", 3, observe=[2, 0])
     bounded = GymLanes("CartPole-v1", 3, None, "bounds", [-0.5, -5], [0.5, 5], [2, 0])
     for env in (whole, some, bounded):
