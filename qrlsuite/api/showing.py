@@ -89,7 +89,7 @@ def describe(
     if not found:
         names = [each for spec in among for each in registered.of(spec)] or list(compose.summaries())
         names += published_studies.names() if specs.StudySpec in among else []
-        more = "; --published looks among the published entries, too" if kind is None else ""
+        more = " (--published looks among the published entries, too)" if kind is None else ""
         raise UnknownNameError(f"nothing called '{name}'{nearest(name, names)}{more}")
     if len(found) > 1:
         singulars = " or ".join(f"`show {each.kind} {name}`" for each in found)
