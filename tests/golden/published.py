@@ -32,6 +32,7 @@ from typing import Any
 
 from qrlsuite import api
 from qrlsuite.errors import QrlSuiteError
+from qrlsuite.leaderboard.shelf import published_studies
 from tests.commands import answer, say
 
 ROOT = Path(__file__).parents[2]
@@ -65,15 +66,14 @@ NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?%?|\.\d+")
 
 def _names(folder: str) -> list[str]:
     """Return what is in a folder of published results: tasks with entries, or studies that have taken a look."""
-    paths = (ROOT / "leaderboard" / folder).iterdir()
-    return sorted(path.name for path in paths if folder != "plans" or (path / "looks.jsonl").is_file())
+    if folder == "plans":
+        return published_studies.names(begun=True)
+    return sorted(path.name for path in (ROOT / "leaderboard" / folder).iterdir())
 
 
 def _studies() -> list[str]:
-    plans = {path.parent.name for path in (ROOT / "leaderboard" / "plans").glob("*/plan.toml")} - {
-        *_names("plans")
-    }
-    return [study["name"] for study in answer("list", "studies") if study["name"] not in plans]
+    only_planned = {*published_studies.names()} - {*published_studies.names(begun=True)}
+    return [study["name"] for study in answer("list", "studies") if study["name"] not in only_planned]
 
 
 def _boards() -> Iterator[str]:
