@@ -24,7 +24,7 @@ from typing import Any
 
 from PIL import Image, ImageSequence
 from PIL.PngImagePlugin import PngInfo
-from tables import PAIRS, ROOT, short_names
+from tables import PAIRS, ROOT, TOGETHER, short_names
 
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import AGENTS, encode_record
@@ -152,19 +152,13 @@ PICTURES: dict[str, Picture] = {
     "study-fig1-surface.png": Plot("plot surface --study fig1 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig6-bars.png": Plot("plot bars --study fig6 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig7-scaling.png": Plot("plot scaling --study fig7 --published --seeds 30", ("entries/beam6g/*",)),
-    "study-equal-size-tasks.png": Plot(
-        "plot pairs --study equal-size-beam6g --study equal-size-beam6g-degree5 --study equal-size-beam6g-a3-0 "
-        "--study equal-size-cartpole --study equal-size-frozenlake --study equal-size-vqe-h2 --study equal-size-pulse",
-        ("plans/equal-size-*", "plans/equal-size-*/*/*"),
-    ),
-    "study-advantage-tasks.png": Plot(
-        "plot pairs --study advantage-cartpole --study advantage-vqe-h2",
-        ("plans/advantage-*", "plans/advantage-*/*/*"),
-    ),
-    "study-equal-size-ppo-tasks.png": Plot(
-        "plot pairs --study equal-size-beam6g-ppo --study equal-size-cartpole-ppo",
-        ("plans/equal-size-*-ppo", "plans/equal-size-*-ppo/*/*"),
-    ),
+    **{
+        f"study-{name}-tasks.png": Plot(
+            f"plot pairs {' '.join(f'--study {each}' for each in TOGETHER[name])}",
+            tuple(f"plans/{each}{below}" for each in TOGETHER[name] for below in ("", "/*/*")),
+        )
+        for name in ("advantage", "equal-size", "equal-size-ppo")
+    },
     "study-ppo-bars.png": Plot("plot bars --study ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
     "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),
     "episode-vqe.png": Plot("plot episode seed=2 --task vqe-ising", ()),

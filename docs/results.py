@@ -7,12 +7,13 @@ stands below its line `---`, how settings were tried by hand and when, is folded
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 
 from tables import (
     PAIRS,
     ROOT,
+    TOGETHER,
     board,
     entries,
     main_facts,
@@ -22,6 +23,7 @@ from tables import (
     pairs,
     published,
     settings,
+    several,
     verdicts,
 )
 
@@ -37,17 +39,6 @@ JUDGMENTS = ROOT / "leaderboard" / "judgments"
 MOST = 120
 """Words of a judgment."""
 BOARDS = ("beam6g", *PAIRS)
-TOGETHER: Mapping[str, tuple[str, ...]] = {
-    "advantage": ("advantage-cartpole", "advantage-vqe-h2"),
-    "equal-size": tuple(
-        f"equal-size-{task}"
-        for task in ("beam6g", "beam6g-degree5", "beam6g-a3-0", "cartpole", "frozenlake", "vqe-h2", "pulse")
-    ),
-    "equal-size-ppo": ("equal-size-beam6g-ppo", "equal-size-cartpole-ppo"),
-    "quantum-or-not-elsewhere": ("quantum-or-not-degree5", "quantum-or-not-a3-0"),
-}
-"""Studies of one question on several tasks, by the name of their page."""
-
 READING = """
 A [study](../decisions.md) fixes its entries, pairs, seeds and error before its first seed is trained, and compares
 after 20 seeds, after 40, and so on. A [board](../compare.md) compares all entries of a task.
@@ -199,10 +190,10 @@ def of_tasks(name: str) -> str:
     """Return the page of studies that ask one question on several tasks."""
     members = TOGETHER[name]
     judgment, notes = judged(name)
-    summary = published(members[0]).study.file.summary
+    summary = several(name)[0].study.file.summary
     links = ", ".join(f"[`{each}`]({each}.md)" for each in members)
     picture = f"![{summary}](../images/study-{name}-tasks.png)" if name != "quantum-or-not-elsewhere" else ""
-    shared = means("+".join(members)) if name != "quantum-or-not-elsewhere" else ()
+    shared = means(name) if name != "quantum-or-not-elsewhere" else ()
     return _page(
         f"{name}: several tasks",
         f"**{summary}** Studies: {links}.",
@@ -210,8 +201,8 @@ def of_tasks(name: str) -> str:
         picture,
         _code(f"qrlsuite show {' '.join(members)}"),
         f"Steps below threshold, mean over seeds and thresholds:\n\n{markdown(shared)}" if shared else "",
-        f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several('+'.join(members)))}",
-        "\n".join(f"- {line}" for line in together([published(each) for each in members]).claim_lines),
+        f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several(name))}",
+        "\n".join(f"- {line}" for line in together(several(name)).claim_lines),
         _folded("Notes", notes),
     )
 

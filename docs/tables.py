@@ -3,7 +3,7 @@
 On a page by hand, a comment names the task or the studies and the kind of the table that follows it:
 
     <!-- table: beam6g tiers -->
-    <!-- table: equal-size-beam6g+equal-size-pulse rivals -->
+    <!-- table: equal-size rivals -->
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
-from qrlsuite.results.text import hours_text, interval_text, mean_text, steps_text
+from qrlsuite.results.text import hours_text, interval_text, mean_text, percent, steps_text
 from qrlsuite.studies.state import State, by_question, difference_text, versus
 from qrlsuite.studies.together import together
 from qrlsuite.training.trainer import count_parameters
@@ -94,9 +94,25 @@ def entries(outcome: State) -> Rows:
             )
 
 
+SEVEN = ("beam6g", "beam6g-degree5", "beam6g-a3-0", "cartpole", "frozenlake", "vqe-h2", "pulse")
+_BEGUN = published_studies.names(begun=True)
+TOGETHER: dict[str, tuple[str, ...]] = {
+    "advantage": tuple(name for task in SEVEN if (name := f"advantage-{task}") in _BEGUN),
+    "equal-size": tuple(f"equal-size-{task}" for task in SEVEN),
+    "equal-size-ppo": ("equal-size-beam6g-ppo", "equal-size-cartpole-ppo"),
+    "quantum-or-not-elsewhere": ("quantum-or-not-degree5", "quantum-or-not-a3-0"),
+}
+"""Studies of one question on several tasks, by the name of their page."""
+
+
+def several(names: str) -> list[State]:
+    """Read the studies of a page of several, or those that `+` joins."""
+    return [published(name) for name in TOGETHER.get(names) or names.split("+")]
+
+
 def of_several(names: str) -> Rows:
     """The pairs that several studies share, on average over their tasks."""
-    read = together([published(name) for name in names.split("+")])
+    read = together(several(names))
     sheet = Sheet("", read.columns(), read.pairs)
     yield [column.title for column in sheet.columns]
     yield from sheet.cells
@@ -104,7 +120,7 @@ def of_several(names: str) -> Rows:
 
 def means(names: str) -> Rows:
     """The steps of the entries that several studies share, a row for each study's task."""
-    outcomes = [published(name) for name in names.split("+")]
+    outcomes = several(names)
     entries = [str(each.name) for each in outcomes[0].study.file.entries]
     yield "task", "seeds", *entries
     for outcome in outcomes:
@@ -115,10 +131,10 @@ def means(names: str) -> Rows:
 
 
 def rivals(names: str) -> Rows:
-    """How many more steps each rival needs than the first entry, a row for each study's task."""
-    outcomes = [published(name) for name in names.split("+")]
+    """How many more steps each rival needs than the first entry, and which lead over all of them is excluded."""
+    outcomes = several(names)
     first, *others = [str(each.name) for each in outcomes[0].study.file.entries]
-    yield "task", *others, "after seeds"
+    yield "task", *others, "excluded lead", "after seeds"
     for outcome in outcomes:
         found = {pair.second: pair for pair in outcome.pairs if pair.first == first}
         cells = []
@@ -126,8 +142,15 @@ def rivals(names: str) -> Rows:
             share, interval = difference_text(pair, outcome.study.grid)
             said = "" if pair.verdict.startswith("not told") else f", {outcome.verdict(pair)}"
             cells.append(f"{share} ({interval}){said}")
+        most = min(found[other].interval[1] for other in others)
+        excluded = f"above {percent(most).lstrip('+')}" if most > 0 else "any"
         seeds = sorted({pair.n_runs for pair in found.values()})
-        yield f"`{outcome.study.task}`", *cells, " to ".join(map(str, sorted({seeds[0], seeds[-1]})))
+        yield (
+            f"`{outcome.study.task}`",
+            *cells,
+            excluded,
+            " to ".join(map(str, sorted({seeds[0], seeds[-1]}))),
+        )
 
 
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:

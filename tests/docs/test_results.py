@@ -87,7 +87,7 @@ def test_one_size_on_several_tasks() -> None:
     assert "**On none of the seven tasks is the circuit shown to beat all three.**" in FINDINGS
     assert "The circuit beats the ReLU network on three tasks, and its mean-field control on none;" in README
     assert "sines beat the circuit on three, and it beats them on one." in README
-    network, sines, mean_field = list(tables.of_several("+".join(results.TOGETHER["equal-size"])))[1:]
+    network, sines, mean_field = list(tables.of_several("equal-size"))[1:]
     assert {row[1] for row in (network, sines, mean_field)} == {"not told apart"}
     assert "The mean over the tasks [decides nothing]" in FINDINGS
 
