@@ -8,13 +8,13 @@ nothing, and they interact (`Surface`). Far away it levels off, where nothing is
 all of it. Runs scatter by 28 percent. Three searches get equally many runs: `random` on 20 seeds each, successive
 halving over seeds, which was the default once, and today's. All of them try the untuned setting, which lies anywhere.
 
-    python benchmarks/tuning.py --stored runs/tuning [--repetitions 100]
+    python benchmarks/tuning.py --stored runs/tuning [--repetitions 100] [--out FILE.png]
 
 In place of drawn surfaces, those of stored searches: the surrogate's mean after all trials of a search, with runs
 that scatter as its own. A search with a last round is repeated on each until it states 5 percent, or has 40 trials an
 option, and what it says is held against the surface. That is smoother than what was searched, so coverage is rather
-too good. Further tables say how much more steps take when an option moves by a factor of 2 (--repetitions 0: these
-alone), and what one setting for all tasks costs each model.
+too good. Further tables (--repetitions 0: these alone) say how many more steps a model needs when an option moves by a
+factor of 2 from its best value, which --out draws for other factors, and what one setting for all tasks costs it.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ from qrlsuite.tuning.surrogate import BATCH, NEAR, SPREAD, Climb, Surrogate, reg
 Floats = NDArray[np.float64]
 VISIT = 4
 SEEDS = 20
+COLORS = {"circuit": "C0", "mean-field": "C1", "network": "C2", "sines": "C3"}
 
 
 class Surface:
@@ -213,8 +214,9 @@ class Stored:
         _, fixed = self._split(entry)
         grid, steps = entry.task.file.ranking.grid, entry.task.file.protocol.interactions
         self.name = f"{record.task} | {entry.label.partition(' preset=')[0]}"
-        kind = (found.model_options.get(name) for name in ("activation", "ansatz_options"))
-        self.task, self.model = record.task, " ".join([found.model, *(str(each) for each in kind if each)])
+        control = dict(found.model_options.get("ansatz_options") or {}).get("entangled")
+        network = "sines" if found.model_options.get("activation") == "sin" else "network"
+        self.task, self.model = record.task, network if found.model == "mlp" else control or "circuit"
         tried, runs = [], []
         for store in entries(path.parent, record.task):
             identity = store.record().identity
@@ -264,6 +266,13 @@ class Stored:
         """Return the real regret of a place."""
         return max(0.0, math.exp(float(self(place[None])[0]) - self.least) - 1)
 
+    def moved(self, d: int, factors: Floats) -> Floats:
+        """Return how many more steps option d costs at factors (F,) of its best value, as shares (F,)."""
+        places = np.repeat(self.best[None], len(factors), axis=0)
+        places[:, d] += np.log(factors) / np.diff(self.ends)[d]
+        result: Floats = np.maximum(0, np.expm1(self(places) - self.least))
+        return result
+
     def repeat(self, number: int) -> list[float]:
         """Return runs; regret, said and inside before the last round; among the last, said, inside; regret after."""
         self.generator = np.random.default_rng([74, number])
@@ -286,8 +295,8 @@ class Stored:
         return [runs, real, said.expected, inside[0], own, among.expected, inside[1], after]
 
 
-def stored(folder: Path, repetitions: int) -> None:
-    """Print the tables of stored searches."""
+def stored(folder: Path, repetitions: int, out: Path | None) -> None:
+    """Print the tables of stored searches, and draw what moving an option costs."""
     searches = [Stored(path) for path in sorted(folder.glob("*.toml"))]
     if repetitions:
         print(
@@ -300,18 +309,17 @@ def stored(folder: Path, repetitions: int) -> None:
             f"{each.name} | {runs:.0f} | {' | '.join(f'{share:.1%}' for share in shares)}",
             flush=True,
         )
-    print("\ntask | model | runs | option: more steps at half of the best value, at twice")
-    for each in searches:
-        told = []
-        for d, name in enumerate(each.varied):
-            move = np.eye(len(each.varied))[d] * math.log(2) / np.diff(each.ends)[d]
-            two = (f"{each.regret(each.best + sign * move):.0%}" for sign in (-1, 1))
-            told.append(f"{name.split('.')[1]}: {', '.join(two)}")
-        print(f"{each.name} | {each.count} | {' | '.join(told)}")
-    print("\nmodel | one setting for all tasks | more steps than at each task's own")
     groups = defaultdict(list)
     for each in searches:
         groups[each.model, (*each.varied,)].append(each)
+    print("\nmodel | option | more steps at half of the best value and at twice it, mean (task by task)")
+    for (model, names), group in groups.items():
+        for d, name in enumerate(names):
+            costs = np.array([each.moved(d, np.array([0.5, 2.0])) for each in group])
+            told = ", ".join(f"{each.task} {low:.0%} {high:.0%}" for each, (low, high) in zip(group, costs))
+            low, high = costs.mean(axis=0)
+            print(f"{model} | {name.split('.')[1]} | {low:.0%} and {high:.0%} ({told})")
+    print("\nmodel | one setting for all tasks | more steps than at each task's own")
     for (model, names), group in groups.items():
         ends = np.array([each.ends for each in group])
         low, high = ends[..., 0].min(axis=0), ends[..., 1].max(axis=0)
@@ -322,6 +330,36 @@ def stored(folder: Path, repetitions: int) -> None:
         print(
             f"{model} | {setting} | {', '.join(f'{g.task} {math.expm1(c):.0%}' for g, c in zip(group, costs[:, at]))}"
         )
+    if out:
+        draw(searches, out)
+
+
+def draw(searches: Sequence[Stored], out: Path) -> None:
+    """Draw what factors of the best value of each option cost: a color for each model, a thin line for each task."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import PercentFormatter
+
+    factors = 2 ** np.linspace(-4, 4, 65)
+    options = [*dict.fromkeys(name for each in searches for name in each.varied)]
+    figure = Figure((3.2 * len(options), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(options), squeeze=False, sharey=True)[0]
+    for option, axes in zip(options, panels):
+        lines = defaultdict(list)
+        for each in searches:
+            if option in each.varied:
+                lines[each.model].append(each.moved(each.varied.index(option), factors))
+        for model, found in lines.items():
+            [line] = axes.plot(
+                factors, np.mean(found, axis=0), color=COLORS[model], linewidth=2.5, label=model
+            )
+            axes.plot(factors, np.transpose(found), color=line.get_color(), linewidth=0.6, alpha=0.6)
+        axes.set_xscale("log", base=2)
+        axes.set(xlabel=f"{option.split('.')[1]} / its best value", ylim=(0, 1))
+        axes.yaxis.set_major_formatter(PercentFormatter(1))
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize="small")
+    panels[0].set_ylabel("more steps than at the best")
+    figure.savefig(out, dpi=110)
 
 
 def main() -> None:
@@ -333,9 +371,12 @@ def main() -> None:
     parser.add_argument("--ripple", type=float, default=0.02)
     parser.add_argument("--shared", type=int, default=0, help="options that take a population of their own")
     parser.add_argument("--stored", type=Path, help="a folder of stored searches, such as runs/tuning")
+    parser.add_argument(
+        "--out", type=Path, help="draw what stored searches say of moved options to this file"
+    )
     arguments = parser.parse_args()
     if arguments.stored:
-        stored(arguments.stored, arguments.repetitions)
+        stored(arguments.stored, arguments.repetitions, arguments.out)
         return
     begin = time.monotonic()
     with concurrent.futures.ProcessPoolExecutor(os.cpu_count()) as pool:
