@@ -309,6 +309,7 @@ def stored(folder: Path, repetitions: int, out: Path | None) -> None:
             f"{each.name} | {runs:.0f} | {' | '.join(f'{share:.1%}' for share in shares)}",
             flush=True,
         )
+    searches.sort(key=lambda search: [*COLORS].index(search.model))
     groups = defaultdict(list)
     for each in searches:
         groups[each.model, (*each.varied,)].append(each)
@@ -339,7 +340,7 @@ def draw(searches: Sequence[Stored], out: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import PercentFormatter
 
-    factors = 2 ** np.linspace(-4, 4, 65)
+    factors = 2 ** np.linspace(-3, 3, 49)
     options = [*dict.fromkeys(name for each in searches for name in each.varied)]
     figure = Figure((3.2 * len(options), 3.6), layout="constrained")
     panels = figure.subplots(1, len(options), squeeze=False, sharey=True)[0]
