@@ -213,7 +213,6 @@ class Stored:
         )
         _, fixed = self._split(entry)
         grid, steps = entry.task.file.ranking.grid, entry.task.file.protocol.interactions
-        self.name = f"{record.task} | {entry.label.partition(' preset=')[0]}"
         control = dict(found.model_options.get("ansatz_options") or {}).get("entangled")
         network = "sines" if found.model_options.get("activation") == "sin" else "network"
         self.task, self.model = record.task, network if found.model == "mlp" else control or "circuit"
@@ -295,21 +294,25 @@ class Stored:
         return [runs, real, said.expected, inside[0], own, among.expected, inside[1], after]
 
 
+def _print_shares(name: str, numbers: Floats) -> None:
+    runs, *shares = numbers
+    print(f"{name} | {runs:.0f} | {' | '.join(f'{share:.1%}' for share in shares)}", flush=True)
+
+
 def stored(folder: Path, repetitions: int, out: Path | None) -> None:
     """Print the tables of stored searches, and draw what moving an option costs."""
     searches = [Stored(path) for path in sorted(folder.glob("*.toml"))]
+    searches.sort(key=lambda search: [*COLORS].index(search.model))
     if repetitions:
         print(
-            "task | entry | runs | regret | it says | within 90% | among three | it says | within 90% | after"
+            "task | model | runs | regret | it says | within 90% | among three | it says | within 90% | after"
         )
-    for each in searches if repetitions else ():
+        every = []
         with concurrent.futures.ProcessPoolExecutor(os.cpu_count()) as pool:
-            runs, *shares = np.mean([*pool.map(each.repeat, range(repetitions))], axis=0)
-        print(
-            f"{each.name} | {runs:.0f} | {' | '.join(f'{share:.1%}' for share in shares)}",
-            flush=True,
-        )
-    searches.sort(key=lambda search: [*COLORS].index(search.model))
+            for each in searches:
+                every.append(np.mean([*pool.map(each.repeat, range(repetitions))], axis=0))
+                _print_shares(f"{each.task} | {each.model}", every[-1])
+        _print_shares(f"mean of {len(searches)} | {repetitions} repetitions of each", np.mean(every, axis=0))
     groups = defaultdict(list)
     for each in searches:
         groups[each.model, (*each.varied,)].append(each)
