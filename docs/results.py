@@ -14,6 +14,7 @@ from tables import (
     PAIRS,
     ROOT,
     TOGETHER,
+    averaged,
     board,
     entries,
     main_facts,
@@ -23,7 +24,6 @@ from tables import (
     pairs,
     published,
     settings,
-    several,
     verdicts,
 )
 
@@ -32,7 +32,6 @@ from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.text import hours_text
 from qrlsuite.studies.state import State
-from qrlsuite.studies.together import together
 
 PAGES = ROOT / "docs" / "results"
 JUDGMENTS = ROOT / "leaderboard" / "judgments"
@@ -188,10 +187,10 @@ def of_board(task: str) -> str:
 
 def of_tasks(name: str) -> str:
     """Return the page of studies that ask one question on several tasks."""
-    members = TOGETHER[name]
+    asked = averaged(name)
     judgment, notes = judged(name)
-    summary = several(name)[0].study.file.summary
-    links = ", ".join(f"[`{each}`]({each}.md)" for each in members)
+    summary = asked.studies[0].study.file.summary
+    links = ", ".join(f"[`{each}`]({each}.md)" for each in TOGETHER[name])
     picture = f"![{summary}](../images/study-{name}-tasks.png)" if name != "quantum-or-not-elsewhere" else ""
     shared = means(name) if name != "quantum-or-not-elsewhere" else ()
     return _page(
@@ -199,10 +198,10 @@ def of_tasks(name: str) -> str:
         f"**{summary}** Studies: {links}.",
         judgment,
         picture,
-        _code(f"qrlsuite show {' '.join(members)}"),
+        _code(f"qrlsuite show {' '.join(each.study.name for each in asked.studies)}"),
         f"Steps below threshold, mean over seeds and thresholds:\n\n{markdown(shared)}" if shared else "",
         f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several(name))}",
-        "\n".join(f"- {line}" for line in together(several(name)).claim_lines),
+        "\n".join(f"- {line}" for line in asked.claim_lines),
         _folded("Notes", notes),
     )
 
