@@ -23,6 +23,9 @@ from torch import Tensor, nn
 Drawn = TypeVar("Drawn")
 _DRAWING = ThreadPoolExecutor(1, "draws ahead")
 
+NUMERICS: dict[str, int] = {}
+"""`numerics` of code that a GPU runs in the place of earlier code, by what it computes; set when it first runs."""
+
 
 class LateChecks:
     """A block within which checks of numbers on a device are only noted there, and read once, at its end.

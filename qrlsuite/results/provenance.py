@@ -61,8 +61,16 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
 
 
 def of(entry: Entry, device: torch.device | None = None) -> Provenance:
-    """Return `collect` of an entry's distributions, and the `numerics` of the suite's own parts, by role."""
-    return collect(entry.distributions(), device).changed(numerics=identity.numerics(entry))
+    """Return `collect` of an entry's distributions, and the `numerics` of the suite's own parts, by role.
+
+    A GPU's `circuit kernels` are among them once they have computed, if they are others than numba-cuda's.
+    """
+    counted = identity.numerics(entry)
+    if device is not None and device.type != "cpu":
+        from qrlsuite.device import NUMERICS
+
+        counted |= NUMERICS
+    return collect(entry.distributions(), device).changed(numerics=counted)
 
 
 def version(distribution: str) -> str | None:
@@ -95,9 +103,9 @@ def difference(here: Provenance, there: Provenance) -> str | None:
         compared = name != "qrlsuite" and (name in there.versions or name in PACKAGES)
         if there.versions.get(name) != number and compared:
             return f"{name} {number} here, {there.versions.get(name)} there"
-    for role, counted in here.numerics.items():
-        if there.numerics.get(role, 1) != counted:
-            return f"numerics {counted} of the {role} here, {there.numerics.get(role, 1)} there"
+    for role in here.numerics | there.numerics:
+        if (counted := here.numerics.get(role, 1)) != (other := there.numerics.get(role, 1)):
+            return f"numerics {counted} of the {role} here, {other} there"
     if there.system != here.system:
         return f"system {here.system} here, {there.system} there"
     if there.python != here.python:

@@ -284,6 +284,8 @@ class GroupRun:
         """Train to the last epoch; on an interruption, save the last finished epoch and raise it again."""
         with Interruptible() as guard:
             try:
+                if early := self.trainer.device.type != "cpu":  # records say which kernels compute there
+                    self._compile()
                 if self.probe is not None:
                     self._compare(self.probe)
                 with guard.deferred():
@@ -294,7 +296,8 @@ class GroupRun:
                     and self.probe.begin(self.trainer)
                 ):
                     self._judge(guard, self.probe)
-                self._compile()
+                if not early:
+                    self._compile()
                 last_save = time.monotonic()
                 while self.trainer.epoch < self.epochs:
                     epoch = self.trainer.train_epoch()

@@ -86,7 +86,7 @@ def main(states: int) -> None:
         chosen = {("iqp", torch.float64)}
         program = NativeBackend(circuits()["iqp"]).program
         room[1] = gpu.GPUSimulator(program).bytes_of(torch.zeros(0, dtype=torch.float64), 1, backward=True)
-    gpu._shared_limit = lambda device: room[states]  # type: ignore[assignment]
+    gpu.shared_limit = lambda device: room[states]  # type: ignore[assignment]
     gpu.BLOCKS = 3  # of 4 lanes, so that one takes a second where blocks share the memory of all
     launched = []
     launch = gpu._launch
@@ -151,7 +151,7 @@ def test_a_missing_package_is_named_once(
     try:
         for _ in range(2):
             backend = NativeBackend(ansatz("iqp", qubits=2, layers=1))
-            assert backend.gpu_simulator is None
+            assert backend.gpu_simulators == []
         said = capsys.readouterr().err
         assert said.count("plain torch operations") == 1
         assert "pip install 'numba-cuda[cu13]'" in said

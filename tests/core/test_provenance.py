@@ -6,11 +6,14 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 
 import qrlsuite
+from qrlsuite.device import NUMERICS
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.results import provenance
 from qrlsuite.results.provenance import commit_of
-from qrlsuite.results.records import Provenance
+from qrlsuite.results.records import DeviceRecord, Provenance
 
 
 def git(folder: Path, *words: str) -> str:
@@ -83,3 +86,16 @@ def test_every_version_is_told_once() -> None:
     made = [Provenance(versions={"numpy": v}, python="3.11", commit=None) for v in ("2.4", "2.3", "2.4")]
     assert provenance.versions(made) == {"numpy": ("2.3", "2.4"), "python": ("3.11",)}
     assert provenance.distinct(origin.commit for origin in made) == ()
+
+
+def test_a_gpus_other_kernels_are_recorded_and_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = resolve("beam6g", "mlp")
+    monkeypatch.setattr(provenance, "_device", lambda device: DeviceRecord(kind="cuda"))
+    before = provenance.of(entry, torch.device("cuda"))
+    monkeypatch.setitem(NUMERICS, "circuit kernels", 2)
+    now = provenance.of(entry, torch.device("cuda"))
+    assert now.numerics == {**before.numerics, "circuit kernels": 2}
+    assert provenance.of(entry, torch.device("cpu")).numerics == before.numerics
+    assert provenance.difference(now, before) == "numerics 2 of the circuit kernels here, 1 there"
+    assert provenance.difference(before, now) == "numerics 1 of the circuit kernels here, 2 there"
+    assert provenance.difference(now, now) is None

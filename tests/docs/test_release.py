@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from email.parser import BytesParser
 from pathlib import Path
 
@@ -47,9 +48,10 @@ def setuptools(hook: str, sources: Path, to: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_wheel_has_the_size_that_readme_states(sources: Path, tmp_path: Path) -> None:
+def test_the_wheel_has_its_kernels_and_the_size_that_readme_states(sources: Path, tmp_path: Path) -> None:
     setuptools("build_wheel", sources, tmp_path)
     (wheel,) = tmp_path.glob("*.whl")
+    assert "qrlsuite/plugins/circuits/native/registers.cu" in zipfile.ZipFile(wheel).namelist()
     stated = re.search(r"wheel\s+has\s+(\d+)\s+MB", (ROOT / "README.md").read_text())
     assert stated
     assert os.path.getsize(wheel) / 1e6 == pytest.approx(int(stated[1]), rel=0.1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
@@ -134,8 +135,9 @@ class NativeBackend:
         """Return expectation values (S, B, O) of inputs and flat parameters (S, P), computed where these are."""
         if inputs.device.type == "cpu":
             return self.simulator()(inputs, flat)
-        if self.gpu_simulator is not None and self.gpu_simulator.takes(inputs):
-            return self.gpu_simulator(inputs, flat)
+        for simulator in self.gpu_simulators:
+            if simulator.takes(inputs):
+                return simulator(inputs, flat)
         return self.by_torch(inputs, flat)
 
     def by_torch(self, inputs: Tensor, flat: Tensor) -> Tensor:
@@ -152,13 +154,16 @@ class NativeBackend:
         return compile_circuit(self.circuit)
 
     @cached_property
-    def gpu_simulator(self) -> gpu.GPUSimulator | None:
-        """The simulator on NVIDIA GPUs, made when first needed; None of a mean-field circuit, or where it fails."""
+    def gpu_simulators(self) -> list[gpu.GPUSimulator]:
+        """The simulators on NVIDIA GPUs, the first choice first; none of mean-field circuits, or where all fail."""
+        made: list[gpu.GPUSimulator] = []
         if self.circuit.mean_field or trouble() is not None:
-            return None
-        from qrlsuite.plugins.circuits.native import gpu
+            return made
+        from qrlsuite.plugins.circuits.native import gpu, registers
 
-        return gpu.GPUSimulator(self.program)
+        if os.environ.get("QRLSUITE_CAPTURE") == "1" and registers_trouble() is None:
+            made.append(registers.RegisterSimulator(self.program))
+        return [*made, gpu.GPUSimulator(self.program)]
 
     def gpu_trouble(self) -> str | None:
         """Return why circuits do not run by kernels on a GPU here, None where they do."""
@@ -216,6 +221,22 @@ def trouble() -> str | None:
         file=sys.stderr,
         flush=True,
     )
+    return problem
+
+
+@cache
+def registers_trouble() -> str | None:
+    """Return why kernels in registers do not run on a GPU here, None where they do; said once."""
+    try:
+        from qrlsuite.plugins.circuits.native import gpu, registers
+
+        if gpu.computes_right(make=registers.RegisterSimulator):
+            return None
+        problem = "wrong numbers"
+    except Exception as error:  # whatever a driver, a compiler, or another version of cuda-core makes of it
+        problem = f"{type(error).__name__}: {error}"
+    said = f"qrlsuite: circuits run by numba-cuda's kernels, for those in registers fail here: {problem}"
+    print(said, file=sys.stderr, flush=True)
     return problem
 
 

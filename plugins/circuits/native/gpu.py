@@ -69,7 +69,7 @@ class GPUSimulator:
     def takes(self, like: Tensor) -> bool:
         """Return whether the circuit is not too large for a GPU's blocks at a tensor's precision."""
         needed = self.bytes_of(like, 0, backward=True)
-        return self.largest <= MOST_QUBITS and needed <= _shared_limit(like.device.index or 0)
+        return self.largest <= MOST_QUBITS and needed <= shared_limit(like.device.index or 0)
 
     def tables(self, like: Tensor) -> tuple[list[Any], list[Any]]:
         """Return the program's arrays on a tensor's device: for both passes, and for `collect`."""
@@ -77,7 +77,7 @@ class GPUSimulator:
         if key not in self._tables:
             run, gather = _run_tables(self.program), _collect_tables(self.program)
             self._tables[key] = tuple(  # type: ignore[assignment]
-                [_view(_tensor(array, like)) for array in arrays] for arrays in (run, gather)
+                [_view(tensor(array, like)) for array in arrays] for arrays in (run, gather)
             )
         return self._tables[key]
 
@@ -86,13 +86,94 @@ class GPUSimulator:
         numbers = 6 * self.blocks + TOGETHER * (self.threads + WARP) + states * self.size
         return (numbers + TOGETHER * self.blocks * backward) * like.element_size()
 
+    def forward(self, x: Tensor, p: Tensor, keep: bool) -> tuple[Tensor, Tensor]:
+        """Return expectation values, and the final state of every lane; of one lane alone without `keep`."""
+        lanes = x.shape[0] * x.shape[1]
+        tables, _ = self.tables(x)
+        finals = x.new_empty((lanes if keep else 1, self.size))
+        shared = self.bytes_of(x, 1, backward=False)
+        fits = shared <= shared_limit(x.device.index or 0)
+        blocks = lanes if fits else min(lanes, BLOCKS)
+        work = x.new_empty((1, 1) if fits else (blocks, self.size))
+        out = x.new_empty((*x.shape[:2], len(self.program.observables)))
+        _launch(
+            "forward shared" if fits else "forward",
+            x,
+            blocks,
+            self.threads,
+            shared if fits else self.bytes_of(x, 0, backward=False),
+            *tables,
+            self.size,
+            _view(x),
+            _view(p),
+            _view(work),
+            _view(finals),
+            int(keep),
+            _view(out),
+        )
+        return out, finals
 
-def _tensor(array: NDArray[Any], like: Tensor) -> Tensor:
+    def backward(self, x: Tensor, p: Tensor, finals: Tensor, cotangent: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gradients of inputs and parameters."""
+        lanes = x.shape[0] * x.shape[1]
+        tables, gather = self.tables(x)
+        limit = shared_limit(x.device.index or 0)
+        states = max((s for s in (1, 2) if self.bytes_of(x, s, backward=True) <= limit), default=0)
+        blocks = lanes if states == 2 else min(lanes, BLOCKS)
+        work = x.new_empty((1, 1) if states == 2 else (2 * blocks, self.size))
+        slopes = x.new_empty((lanes, max(len(self.program.angles), 1)))
+        _launch(
+            ("backward", "backward half", "backward shared")[states],
+            x,
+            blocks,
+            self.threads,
+            self.bytes_of(x, states, backward=True),
+            *tables,
+            self.size,
+            _view(x),
+            _view(p),
+            _view(work),
+            _view(finals),
+            _view(cotangent),
+            _view(slopes),
+        )
+        grad_x, grad_p = torch.zeros_like(x), torch.zeros_like(p)
+        count = x.numel() + p.numel()
+        if count:
+            _launch(
+                "collect",
+                x,
+                -(-count // 128),
+                128,
+                0,
+                *gather,
+                _view(x),
+                _view(p),
+                _view(slopes),
+                _view(grad_x),
+                _view(grad_p),
+            )
+        return grad_x, grad_p
+
+
+def tensor(array: NDArray[Any], like: Tensor) -> Tensor:
     """Return an array on a tensor's device: indices in 32 bits, numbers in its precision. None is empty."""
     if array.size == 0:
         array = np.zeros((1, *array.shape[1:]), array.dtype)
     kind = torch.int32 if array.dtype.kind == "i" else like.dtype
     return torch.from_numpy(array).to(like.device, kind).contiguous()
+
+
+def observables(program: Program) -> list[tuple[int, int]]:
+    """Return the component of every observable, and its bits there as a mask."""
+    found: list[tuple[int, int]] = []
+    for index in program.observables.tolist():
+        if index < program.qubits:
+            owner = max(row for row in range(len(program.components)) if program.components[row, 2] <= index)
+            found.append((owner, 1 << (index - int(program.components[owner, 2]))))
+        else:
+            found.append(tuple(program.products[index - program.qubits].tolist()))
+    return found
 
 
 def _run_tables(program: Program) -> list[NDArray[Any]]:
@@ -105,14 +186,9 @@ def _run_tables(program: Program) -> list[NDArray[Any]]:
                 source = program.source(int(steps[m, 1]), int(steps[m, 2]), component[0])
                 steps[m, 1] = sum(len(source) for source in sources)
                 sources.append(source)
-    observables = []
-    for index in program.observables.tolist():
-        if index < program.qubits:
-            owner = max(row for row in range(len(program.components)) if program.components[row, 2] <= index)
-            mask = 1 << (index - int(program.components[owner, 2]))
-        else:
-            owner, mask = program.products[index - program.qubits].tolist()
-        observables.append((program.components[owner, 1], program.components[owner, 0], mask))
+    measured = [
+        (program.components[c, 1], program.components[c, 0], mask) for c, mask in observables(program)
+    ]
     return [
         program.components,
         steps,
@@ -123,7 +199,7 @@ def _run_tables(program: Program) -> list[NDArray[Any]]:
         program.blocks,
         np.concatenate([*sources, np.zeros(0, np.int64)]),
         program.negative,
-        np.array(observables, np.int64).reshape(-1, 3),
+        np.array(measured, np.int64).reshape(-1, 3),
     ]
 
 
@@ -154,19 +230,19 @@ def _view(tensor: Tensor) -> Any:
 
 
 @torch.enable_grad()  # the first circuit may be one of an agent that only acts
-def computes_right(device: str = "cuda") -> bool:
+def computes_right(device: str = "cuda", make: type[GPUSimulator] = GPUSimulator) -> bool:
     """Compute <Z> = cos(x + w) and its slopes on torch's current GPU; return whether they are right."""
     circuit = Circuit(1)
     circuit.append("RX", 0, circuit.input(0) + circuit.parameter("w", (1,))[0])
     x, w = (torch.full(shape, 0.25, device=device, requires_grad=True) for shape in ((1, 1, 1), (1, 1)))
-    value = GPUSimulator(compile_circuit(circuit))(x, w)
+    value = make(compile_circuit(circuit))(x, w)
     slopes = torch.autograd.grad(value.sum(), [x, w])
     found = [float(number) for number in (value, *slopes)]
     return np.allclose(found, [math.cos(0.5), -math.sin(0.5), -math.sin(0.5)], atol=1e-6)
 
 
 @cache
-def _shared_limit(device: int) -> int:
+def shared_limit(device: int) -> int:
     """Return how many bytes of shared memory a block of this GPU may have."""
     if not torch.cuda.is_available():
         return ALWAYS_SHARED
@@ -190,20 +266,25 @@ def _launch(name: str, like: Tensor, blocks: int, threads: int, shared: int, *ar
 
 def _allow(kernel: Any, shared: int, like: Tensor, arguments: Any) -> None:
     """Allow a kernel more shared memory than every GPU grants."""
-    driver: Any = importlib.import_module("cuda.bindings.driver")
     device = like.device.index or 0
     if _ALLOWED.get((kernel, device), 0) >= shared:
         return
     compiled = kernel.compile(tuple(kernel.typeof_pyval(argument) for argument in arguments))
+    allow(compiled._codelibrary.get_cufunc().handle, shared, device)
+    _ALLOWED[kernel, device] = shared
+
+
+def allow(handle: Any, shared: int, device: int) -> None:
+    """Let the driver give a kernel's blocks so many bytes of shared memory."""
+    driver: Any = importlib.import_module("cuda.bindings.driver")
     (status,) = driver.cuKernelSetAttribute(
         driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES,
         shared,
-        compiled._codelibrary.get_cufunc().handle,
+        handle,
         driver.CUdevice(device),
     )
     if status != driver.CUresult.CUDA_SUCCESS:
         raise RuntimeError(f"the GPU refuses a block {shared} bytes of shared memory: {status}")
-    _ALLOWED[kernel, device] = shared
 
 
 class _GPUExpectations(torch.autograd.Function):
@@ -212,30 +293,8 @@ class _GPUExpectations(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, flat: Tensor, simulator: GPUSimulator) -> Tensor:
         x, p = inputs.detach().contiguous(), flat.detach().contiguous()
-        lanes = x.shape[0] * x.shape[1]
         keep = any(ctx.needs_input_grad[:2])
-        tables, _ = simulator.tables(x)
-        finals = x.new_empty((lanes if keep else 1, simulator.size))
-        shared = simulator.bytes_of(x, 1, backward=False)
-        fits = shared <= _shared_limit(x.device.index or 0)
-        blocks = lanes if fits else min(lanes, BLOCKS)
-        work = x.new_empty((1, 1) if fits else (blocks, simulator.size))
-        out = x.new_empty((*x.shape[:2], len(simulator.program.observables)))
-        _launch(
-            "forward shared" if fits else "forward",
-            x,
-            blocks,
-            simulator.threads,
-            shared if fits else simulator.bytes_of(x, 0, backward=False),
-            *tables,
-            simulator.size,
-            _view(x),
-            _view(p),
-            _view(work),
-            _view(finals),
-            int(keep),
-            _view(out),
-        )
+        out, finals = simulator.forward(x, p, keep)
         ctx.simulator = simulator
         ctx.save_for_backward(x, p, *([finals] if keep else []))
         return out
@@ -243,43 +302,4 @@ class _GPUExpectations(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, Tensor, None]:
         x, p, finals = ctx.saved_tensors
-        simulator: GPUSimulator = ctx.simulator
-        lanes = x.shape[0] * x.shape[1]
-        tables, gather = simulator.tables(x)
-        limit = _shared_limit(x.device.index or 0)
-        states = max((s for s in (1, 2) if simulator.bytes_of(x, s, backward=True) <= limit), default=0)
-        blocks = lanes if states == 2 else min(lanes, BLOCKS)
-        work = x.new_empty((1, 1) if states == 2 else (2 * blocks, simulator.size))
-        slopes = x.new_empty((lanes, max(len(simulator.program.angles), 1)))
-        _launch(
-            ("backward", "backward half", "backward shared")[states],
-            x,
-            blocks,
-            simulator.threads,
-            simulator.bytes_of(x, states, backward=True),
-            *tables,
-            simulator.size,
-            _view(x),
-            _view(p),
-            _view(work),
-            _view(finals),
-            _view(cotangents[0].to(x.dtype).contiguous()),
-            _view(slopes),
-        )
-        grad_x, grad_p = torch.zeros_like(x), torch.zeros_like(p)
-        count = x.numel() + p.numel()
-        if count:
-            _launch(
-                "collect",
-                x,
-                -(-count // 128),
-                128,
-                0,
-                *gather,
-                _view(x),
-                _view(p),
-                _view(slopes),
-                _view(grad_x),
-                _view(grad_p),
-            )
-        return grad_x, grad_p, None
+        return (*ctx.simulator.backward(x, p, finals, cotangents[0].to(x.dtype).contiguous()), None)
