@@ -238,7 +238,6 @@ class Stored:
         places = np.array([*tried, *(low + (high - low) * qmc.Halton(len(low), seed=0).random(4000))])
         self.best = places[int(self(places).argmin())]
         self.least = float(self(self.best[None])[0])
-        self.count = sum(map(len, runs))
         self.generator = np.random.default_rng(0)
 
     def _split(self, entry: Entry) -> tuple[Floats, object]:
@@ -266,7 +265,10 @@ class Stored:
         return max(0.0, math.exp(float(self(place[None])[0]) - self.least) - 1)
 
     def moved(self, d: int, factors: Floats) -> Floats:
-        """Return how many more steps option d costs at factors (F,) of its best value, as shares (F,)."""
+        """Return how many more steps option d costs at factors (F,) of its best value, as shares (F,).
+
+        Where no setting was tried, the surrogate extrapolates.
+        """
         places = np.repeat(self.best[None], len(factors), axis=0)
         places[:, d] += np.log(factors) / np.diff(self.ends)[d]
         result: Floats = np.maximum(0, np.expm1(self(places) - self.least))

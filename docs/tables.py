@@ -24,7 +24,7 @@ from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.boards.tables import main_section
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
-from qrlsuite.results.text import hours_text, interval_text, mean_text, percent, steps_text
+from qrlsuite.results.text import hours_text, interval_text, mean_text, steps_text
 from qrlsuite.studies.state import State, by_question, difference_text, versus
 from qrlsuite.studies.together import StudiesTogether, together
 from qrlsuite.training.trainer import count_parameters
@@ -108,7 +108,7 @@ TOGETHER: dict[str, tuple[str, ...]] = {
 
 
 def several(names: str) -> list[State]:
-    """Read the studies of a page of several, or those that `+` joins."""
+    """Read the studies of a name in `TOGETHER`, or the studies whose names `+` joins."""
     return [published(name) for name in TOGETHER.get(names) or names.split("+")]
 
 
@@ -138,10 +138,11 @@ def means(names: str) -> Rows:
 
 
 def rivals(names: str) -> Rows:
-    """How many more steps each rival needs than the first entry, and which lead over all of them is excluded."""
+    """How many more steps each rival needs than the first entry; where it is claimed, the smallest excluded lead."""
     outcomes = several(names)
     first, *others = [str(each.name) for each in outcomes[0].study.file.entries]
-    yield "task", *others, "excluded lead", "after seeds"
+    claimed = bool(outcomes[0].decision.claims)
+    yield "task", *others, *["excluded lead"] * claimed, "after seeds"
     for outcome in outcomes:
         found = {pair.second: pair for pair in outcome.pairs if pair.first == first}
         cells = []
@@ -149,15 +150,10 @@ def rivals(names: str) -> Rows:
             share, interval = difference_text(pair, outcome.study.grid)
             said = "" if pair.verdict.startswith("not told") else f", {outcome.verdict(pair)}"
             cells.append(f"{share} ({interval}){said}")
-        most = min(found[other].interval[1] for other in others)
-        excluded = f"above {percent(most).lstrip('+')}" if most > 0 else "any"
+        leads = [each.excluded for each in outcome.decision.claims if each.claim.at_most is None]
+        cells += [f"above {100 * lead:.0f}%" if lead > 0 else "any" for lead in leads]
         seeds = sorted({pair.n_runs for pair in found.values()})
-        yield (
-            f"`{outcome.study.task}`",
-            *cells,
-            excluded,
-            " to ".join(map(str, sorted({seeds[0], seeds[-1]}))),
-        )
+        yield f"`{outcome.study.task}`", *cells, " to ".join(map(str, sorted({seeds[0], seeds[-1]})))
 
 
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:

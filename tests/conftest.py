@@ -351,7 +351,7 @@ def _once(tmp_path_factory: pytest.TempPathFactory) -> Train:
 
 @pytest.fixture
 def kept(_once: Train, tmp_path: Path) -> Train:
-    """Return a copy of what `train` would leave, trained once in a session: for tests of results."""
+    """Return a copy of an entry's folder, which is trained once for all tests."""
 
     def copy(folder: str, *given: Any, **named: Any) -> Path:
         entry = _once(*given, **named)

@@ -195,7 +195,7 @@ class RegisterSimulator(gpu.GPUSimulator):
         return grad_x, grad_p
 
     def _room(self, backward: bool) -> tuple[int, int]:
-        """Return the shared memory of a state in units of 16 bytes, and that of a block in bytes."""
+        """Return how much shared memory a state takes (units of 16 bytes) and a block takes (bytes)."""
         sums = (4 * self.blocks if backward else len(self.program.observables)) << self.bits.warp
         own = 2 * (self.blocks + 1) + -(-sums // 4)
         moved = 1 << self.bits.register  # amplitudes of a thread: all, or halves of one state or two
