@@ -63,10 +63,11 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
 def of(entry: Entry, device: torch.device | None = None) -> Provenance:
     """Return `collect` of an entry's distributions, and the `numerics` of the suite's own parts, by role.
 
-    A GPU's `circuit kernels` are among them once they have computed, if they are others than numba-cuda's.
+    A GPU's `circuit kernels` are among those of a quantum model once they have computed, if they are others than
+    numba-cuda's.
     """
     counted = identity.numerics(entry)
-    if device is not None and device.type != "cpu":
+    if device is not None and device.type != "cpu" and entry.model.family == "quantum":
         from qrlsuite.device import NUMERICS
 
         counted |= NUMERICS

@@ -284,8 +284,7 @@ class GroupRun:
         """Train to the last epoch; on an interruption, save the last finished epoch and raise it again."""
         with Interruptible() as guard:
             try:
-                if early := self.trainer.device.type != "cpu":  # records say which kernels compute there
-                    self._compile()
+                self._compile()  # first, since records say which kernels compute
                 if self.probe is not None:
                     self._compare(self.probe)
                 with guard.deferred():
@@ -296,8 +295,6 @@ class GroupRun:
                     and self.probe.begin(self.trainer)
                 ):
                     self._judge(guard, self.probe)
-                if not early:
-                    self._compile()
                 last_save = time.monotonic()
                 while self.trainer.epoch < self.epochs:
                     epoch = self.trainer.train_epoch()

@@ -11,6 +11,7 @@ import torch
 import qrlsuite
 from qrlsuite.device import NUMERICS
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance
 from qrlsuite.results.provenance import commit_of
 from qrlsuite.results.records import DeviceRecord, Provenance
@@ -89,13 +90,14 @@ def test_every_version_is_told_once() -> None:
 
 
 def test_a_gpus_other_kernels_are_recorded_and_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = resolve("beam6g", "mlp")
+    entry = resolve("beam6g", "vqc-native", settings=[parse_setting("qubits=2")])
     monkeypatch.setattr(provenance, "_device", lambda device: DeviceRecord(kind="cuda"))
     before = provenance.of(entry, torch.device("cuda"))
     monkeypatch.setitem(NUMERICS, "circuit kernels", 2)
     now = provenance.of(entry, torch.device("cuda"))
     assert now.numerics == {**before.numerics, "circuit kernels": 2}
     assert provenance.of(entry, torch.device("cpu")).numerics == before.numerics
+    assert "circuit kernels" not in provenance.of(resolve("beam6g", "mlp"), torch.device("cuda")).numerics
     assert provenance.difference(now, before) == "numerics 2 of the circuit kernels here, 1 there"
     assert provenance.difference(before, now) == "numerics 1 of the circuit kernels here, 2 there"
     assert provenance.difference(now, now) is None
