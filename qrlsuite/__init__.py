@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from qrlsuite.hookspecs import hookimpl as hookimpl
     from qrlsuite.registry import Registry
 
-__version__ = "0.1.1"
+__version__ = "0.2.0"
 
 __all__ = [
     "Circuit", "__version__", "agent", "api", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "hookimpl",

@@ -29,7 +29,7 @@ from qrlsuite.results.seeds import SeedGroup, format_seeds, plan_groups
 from qrlsuite.results.store import EntryStore, entries
 from qrlsuite.results.text import counted, duration_range
 from qrlsuite.statistics.curves import reached
-from qrlsuite.training import device as devices
+from qrlsuite.training import devices
 
 
 def find(

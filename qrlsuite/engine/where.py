@@ -15,7 +15,7 @@ from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.notation import parse_named
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training import device as devices
+from qrlsuite.training import devices
 
 
 @dataclass(frozen=True)

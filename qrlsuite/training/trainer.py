@@ -37,7 +37,7 @@ from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.progress import Progress
 from qrlsuite.seeding import Streams, pack, stream_key, unpack
 from qrlsuite.training import questions, unregistered
-from qrlsuite.training.device import find as find_device
+from qrlsuite.training.devices import find as find_device
 from qrlsuite.training.fences import seeded
 from qrlsuite.training.metering import MeteredEnv
 from qrlsuite.training.standardization import PREFIX, RunningStatistics

@@ -8,20 +8,20 @@ from qrlsuite import options, population, registry, specs
 from qrlsuite.device import LateChecks
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import entry as entries
-from qrlsuite.training import device
+from qrlsuite.training import devices
 from qrlsuite.training.trainer import Trainer
 from tests.algorithms.worlds import Contexts, Group
 
 
 @pytest.mark.parametrize("name", ["cpu", "cuda", "cuda:1"])
 def test_devices_that_there_can_be(name):
-    assert device.check(name) == name
+    assert devices.check(name) == name
 
 
 @pytest.mark.parametrize("name", ["cudda", "mps", "meta", "cuda:", "cuda:-1", "cuda:1\n", "", "CPU"])
 def test_devices_that_there_cannot_be(name):
     with pytest.raises(OptionError, match="give cpu, cuda, or one GPU of several as cuda:1") as caught:
-        device.find(name)
+        devices.find(name)
     assert "\n" not in str(caught.value)
 
 
@@ -40,10 +40,10 @@ def test_gpus_are_looked_for_where_training_is_done(monkeypatch, count, name, me
     monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
     if message is None:
-        assert device.find(name) == torch.device(name)
+        assert devices.find(name) == torch.device(name)
     else:
         with pytest.raises(OptionError, match=message):
-            device.find(name)
+            devices.find(name)
 
 
 @pytest.mark.parametrize(("model", "decay_steps"), [("mlp", None), ("vqc-native", None), ("mlp", 7)])

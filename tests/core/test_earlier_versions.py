@@ -31,13 +31,12 @@ VERSIONS = sorted(path.parent for path in GOLDEN.glob("v*/hashes.json"))
 RUNS = [path.parent for version in VERSIONS for path in sorted(version.glob("interrupted/*/*/entry.json"))]
 CHANGES = {
     "mlp": ("v0.2.0", "model 'mlp' has numerics 2, and had 1"),
-    "vqc": ("v0.2.1", "model 'vqc-native' has numerics 2, and had 1"),
-    "ppo": ("v0.2.1", "algorithm 'ppo' has numerics 2, and had 1"),
-    "reinforce": ("v0.2.1", "algorithm 'reinforce' has numerics 2, and had 1"),
+    "vqc": ("v0.2.0", "model 'vqc-native' has numerics 2, and had 1"),
+    "ppo": ("v0.2.0", "algorithm 'ppo' has numerics 2, and had 1"),
+    "reinforce": ("v0.2.0", "algorithm 'reinforce' has numerics 2, and had 1"),
 }
-"""By part, the version since which its bits are others: layers of networks are compiled sweeps, then circuits with the
-layers around them, and both learn without autograd. Seeds that earlier versions began are another entry, and trained
-anew they are compared number by number."""
+"""By part, the version since which its bits are others: networks and circuits are compiled sweeps, and learn without
+autograd. Seeds that earlier versions began are another entry, and trained anew they are compared number by number."""
 TOLERANCE = 1e-4
 """With torch's kernels for other processors (ATEN_CPU_CAPABILITY=default) lines differ by 1e-7 at most. Parameters are
 not compared: angles without influence on the result follow rounding errors alone, and Adam makes steps of them."""
