@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -29,7 +30,10 @@ class Notebook(File):
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put the pages of results in the navigation, below the page that lists them."""
+    """Put the pages of results in the navigation, below the page that lists them, and link to the project's address."""
+    citation = yaml.safe_load((Path(config.docs_dir).parent / "CITATION.cff").read_text())
+    if address := citation.get("repository-code"):
+        config.repo_url, config.repo_name = address, "Repository"
     (results,) = (item["Results"] for item in config.nav or [] if "Results" in item)
     (section,) = (item[LISTED] for item in results if LISTED in item)
     pages = sorted(f"results/{page.name}" for page in Path(config.docs_dir, "results").glob("*.md"))

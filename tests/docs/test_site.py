@@ -18,7 +18,7 @@ from tests.conftest import HANGS
 from tests.docs.test_plugins import HOOKS
 
 ROOT = Path(__file__).parents[2]
-pytest.importorskip("mkdocs", reason="needs the extra 'docs'")
+load_config = pytest.importorskip("mkdocs.config", reason="needs the extra 'docs'").load_config
 pytest.importorskip("mkdocstrings_handlers.python", reason="needs the extra 'docs'")
 
 
@@ -50,6 +50,15 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
         loaded = re.findall(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=[\"']?([^\"' >]+)", page.read_text())
         loaded += re.findall(r"<link\b(?![^>]*canonical)[^>]*\bhref=[\"']?([^\"' >]+)", page.read_text())
         assert not [address for address in loaded if re.match(r"(?:https?:)?//", address)], page
+
+
+@pytest.mark.parametrize("address", [None, "https://example.org/qrlsuite"])
+def test_pages_link_to_the_projects_address(address: str | None, tmp_path: Path) -> None:
+    config = load_config(str(ROOT / "mkdocs.yml"))
+    config.docs_dir = str(tmp_path / "docs")
+    (tmp_path / "CITATION.cff").write_text(f"repository-code: {address}" if address else "title: qrlsuite")
+    config.plugins.on_config(config)
+    assert config.repo_url == address
 
 
 def test_the_plugins_files_are_on_their_page(site: Path) -> None:
