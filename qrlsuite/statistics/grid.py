@@ -81,8 +81,8 @@ def settled(scores: ArrayLike) -> FloatArray:
     result: FloatArray = np.round(values, 7)
     small = (np.abs(values) < 1e-4) & (np.abs(values) > 1e-290)
     if small.any():
-        scale = 10.0 ** (6 - np.floor(np.log10(np.abs(values[small]))))
-        result[small] = np.round(values[small] * scale) / scale
+        # as text: powers of ten differ in the last bit from processor to processor
+        result[small] = [float(f"{value:.6e}") for value in values[small].tolist()]
     return result
 
 
