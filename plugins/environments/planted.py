@@ -7,7 +7,9 @@ Source of the idea: Jerbi et al., "Parametrized quantum policies for reinforceme
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -18,7 +20,10 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.circuit import ansatz, expectations
+from qrlsuite.circuit import ansatz, create_backend
+
+if TYPE_CHECKING:
+    import torch
 
 QUBITS, LAYERS = 2, 5
 MARGIN = 0.1
@@ -49,15 +54,27 @@ class PlantedOptions:
     steps: Annotated[int, Field(ge=1, le=10_000, description="steps of an episode")] = 20
 
 
+@cache
+def teacher() -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the hidden circuit: a function of points (N, 2) that returns <Z> of both qubits, (N, 2)."""
+    import torch
+
+    run = create_backend("native", ansatz("cx", QUBITS, LAYERS))
+    state = {
+        "scaling": torch.tensor([SCALING], dtype=torch.float64),
+        "weights": torch.tensor([WEIGHTS], dtype=torch.float64),
+    }
+    return lambda points: run(points[None], state, None)[0]
+
+
 def classify(points: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the class 0..3 of points (N, 2), and whether it is clear, both (N,).
 
     Bit k of the class is 1 where qubit k's <Z> exceeds its threshold.
     """
-    circuit = ansatz("cx", QUBITS, LAYERS)
-    values = expectations(
-        circuit, points.astype(np.float64), {"scaling": SCALING, "weights": WEIGHTS}, "native"
-    )
+    import torch
+
+    values = teacher()(torch.from_numpy(points.astype(np.float64)))
     above = values.numpy() - np.array(THRESHOLDS)
     return (above > 0) @ np.array([1, 2]), (np.abs(above) > MARGIN).all(axis=1)
 
