@@ -198,7 +198,7 @@ def of_tasks(name: str) -> str:
         f"**{summary}** Studies: {links}.",
         judgment,
         picture,
-        _code(f"qrlsuite show {' '.join(each.study.name for each in asked.studies)}"),
+        _code(f"qrlsuite show {' '.join(TOGETHER[name])}"),
         f"Steps below threshold, mean over seeds and thresholds:\n\n{markdown(shared)}" if shared else "",
         f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several(name))}",
         "\n".join(f"- {line}" for line in asked.claim_lines),

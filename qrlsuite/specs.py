@@ -144,6 +144,8 @@ class EnvironmentSpec(NumericSpec):
         of tasks that differ in these options only.
     repeats:
         Whether all seeds meet the same episodes on purpose: one, or a fixed cycle of levels. Boards say so.
+    made_for:
+        The family of models that it was made for, such as `"quantum"`: means over tasks leave such a task out.
     """
 
     kind, kinds = "environment", "environments"
@@ -157,6 +159,7 @@ class EnvironmentSpec(NumericSpec):
     pictures: tuple[PictureSpec, ...] = ()
     views: tuple[str, ...] = ()
     repeats: bool = False
+    made_for: str = ""
 
 
 @dataclass(frozen=True, slots=True)

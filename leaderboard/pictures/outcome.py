@@ -132,7 +132,7 @@ def draw_together(together: StudiesTogether) -> Figure:
     """
     if not together.pairs:
         raise OptionError(f"no pair has a mean over the tasks: {'; '.join(together.left_out)}")
-    studies = together.studies
+    studies = (*together.studies, *together.controls)
     found = [{(pair.first, pair.second): pair for pair in each.pairs} for each in studies]
     height = 1.4 + 0.25 * len(together.pairs) * (len(studies) + 2)
     figure = Figure(figsize=(9.5, height), layout="constrained")
@@ -142,16 +142,17 @@ def draw_together(together: StudiesTogether) -> Figure:
     for shared in together.pairs:
         heads.append(len(names))
         names.append(f"{shared.first} / {shared.second}")
-        for task, pairs in zip(together.tasks, found):
+        for each, pairs in zip(studies, found):
             pair = pairs.get((shared.first, shared.second)) or _reversed(pairs[shared.second, shared.first])
             ends += _row(axes, len(names), pair)
             shown.append(pair)
-            names.append(task)
+            made = f", made for {each.study.made_for} models" if each in together.controls else ""
+            names.append(each.study.task + made)
         ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *shared.ratio.interval))
         axes.plot([low, high], [len(names)] * 2, color="black", lw=1.6)
         axes.plot([ratio], [len(names)], "*", color="black", ms=9)
         ends += [low, high]
-        names.append(f"mean of {len(studies)} tasks: {shared.verdict}")
+        names.append(f"mean of {len(together.studies)} tasks: {shared.verdict}")
     margins = {each.study.looks.margin for each in studies}
     shade = margins.pop() if len(margins) == 1 else None
     _ratios(axes, ends, shade or 0.0)

@@ -97,6 +97,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_HERE}.planted:PlantedOptions",
             gymnasium_id="qrlsuite/Planted-v1",
             entry_point=f"{_HERE}.planted:Planted",
+            made_for="quantum",
         )
     )
     register(

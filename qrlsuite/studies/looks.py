@@ -137,6 +137,11 @@ class Study:
         """The name of the task on which all entries are compared."""
         return next(iter(self.entries.values())).task.name
 
+    @property
+    def made_for(self) -> str:
+        """The family of models that the environment was made for, if it was made for one."""
+        return next(iter(self.entries.values())).task.environment.made_for
+
     def _check_block(self) -> None:
         """Refuse seeds that belong to others."""
         block = self.looks.block

@@ -72,6 +72,10 @@ class StudiesTogether(Shown):
 
     Attributes
     ----------
+    studies:
+        The studies that are averaged.
+    controls:
+        Studies of environments that were made for one kind of model: no mean and no claim counts them.
     pairs:
         The pairs that all studies compare and that have a ratio, in the order of the first study.
     left_out:
@@ -81,6 +85,7 @@ class StudiesTogether(Shown):
     """
 
     studies: tuple[State, ...]
+    controls: tuple[State, ...]
     pairs: tuple[SharedPair, ...]
     left_out: tuple[str, ...]
     claims: Mapping[str, tuple[str, ...]]
@@ -153,6 +158,7 @@ class StudiesTogether(Shown):
         """Return it as plain values."""
         return {
             "studies": [each.study.name for each in self.studies],
+            **({"controls": [each.study.name for each in self.controls]} if self.controls else {}),
             "tasks": list(self.tasks),
             "seeds": list(self.seeds),
             "alpha": ALPHA,
@@ -195,6 +201,10 @@ class StudiesTogether(Shown):
                 "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at random."
             )
         yield from map(Text, self.claim_lines)
+        for each in self.controls:
+            yield Text(
+                f"not averaged: {each.study.name}, whose environment was made for {each.study.made_for} models"
+            )
         yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
             yield Text(f"entries with other options on another task: {', '.join(self.changed)}")
@@ -207,6 +217,8 @@ class StudiesTogether(Shown):
 
 def together(studies: Sequence[State]) -> StudiesTogether:
     """Compare the pairs that several studies share, on average over their tasks.
+
+    Tasks that were made for one kind of model are left out of means and claims, unless fewer than two others remain.
 
     Raises
     ------
@@ -222,6 +234,9 @@ def together(studies: Sequence[State]) -> StudiesTogether:
         if any(len(each.seeds[name]) < first_look for name in each.study.entries):
             name = each.study.name
             raise OptionError(f"study '{name}' has not taken its first look: qrlsuite study run {name}")
+    counted = [each for each in studies if not each.study.made_for]
+    if len(counted) < 2:
+        counted = list(studies)
     pairs, ratios, left_out = list(_shared(studies)), list[tuple[str, str, str, MeanRatio]](), list[str]()
     if not pairs:
         names = listed([each.study.name for each in studies])
@@ -230,7 +245,7 @@ def together(studies: Sequence[State]) -> StudiesTogether:
         )
     for asked, first, second in pairs:
         try:
-            ratio = mean_ratio([(_times(each, first), _times(each, second)) for each in studies])
+            ratio = mean_ratio([(_times(each, first), _times(each, second)) for each in counted])
         except OptionError as error:
             left_out.append(f"{first} / {second}: {error}")
         else:
@@ -242,7 +257,8 @@ def together(studies: Sequence[State]) -> StudiesTogether:
         SharedPair(asked, first, second, replace(ratio, p=p, drawn_p=other))
         for (asked, first, second, ratio), p, other in zip(ratios, adjusted, drawn)
     )
-    return StudiesTogether(tuple(studies), found, tuple(left_out), dict(_claims(studies)))
+    controls = tuple(each for each in studies if each not in counted)
+    return StudiesTogether(tuple(counted), controls, found, tuple(left_out), dict(_claims(counted)))
 
 
 def _claims(studies: Sequence[State]) -> Iterator[tuple[str, tuple[str, ...]]]:

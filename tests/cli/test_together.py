@@ -117,6 +117,23 @@ def test_the_mean_of_many_tasks_is_that_of_tasks_like_them(monkeypatch: pytest.M
     assert read.as_dict()["pairs"][0]["drawn_interval"] == list(read.pairs[0].ratio.drawn_interval)
 
 
+def test_a_task_that_was_made_for_one_model_is_drawn_and_counts_in_no_mean() -> None:
+    control, *outcomes = [api.read_study(name) for name in TOGETHER]
+    whole = together(outcomes)  # type: ignore[arg-type]
+    entry = next(iter(control.study.entries.values()))  # type: ignore[union-attr]
+    entry.task.environment = replace(entry.task.environment, made_for="quantum")
+    read = together([control, *outcomes])  # type: ignore[list-item]
+    means = {(pair.first, pair.second): pair.ratio.difference for pair in whole.pairs}
+    assert [pair.ratio.difference for pair in read.pairs] == [means[p.first, p.second] for p in read.pairs]
+    assert read.as_dict()["controls"] == [TOGETHER[0]]
+    assert f"not averaged: {TOGETHER[0]}, whose environment was made for quantum models" in repr(read)
+    [axes] = drawing.draw_together(read).axes
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    assert names[3].endswith(", made for quantum models")
+    assert names[4].startswith("mean of 2 tasks: ")
+    assert len(together([control, outcomes[0]]).studies) == 2  # type: ignore[list-item]
+
+
 def test_a_pair_without_a_ratio_is_left_out_alone() -> None:
     outcomes = [api.read_study(name) for name in TOGETHER[1:]]
     whole = together(outcomes)  # type: ignore[arg-type]
