@@ -28,6 +28,11 @@ ENTRIES = (
     f"network: ddqn mlp width=10 input_scale=5.08 lr=.00193 {OPTIONS}",
     f"sines: ddqn mlp width=10 activation=sin input_scale=8 lr=.00214 {OPTIONS}",
 )
+QUESTION = """[[looks.questions]]
+text = "Does the circuit need fewer steps than every classical model of its size?"
+pairs = [["circuit", "mean-field"], ["circuit", "network"], ["circuit", "sines"]]
+
+"""
 LOOKS = "40 first_seed=300000"
 EPOCHS = 30
 
@@ -66,6 +71,7 @@ def main() -> None:
                 task = write_task(folder, antennas, index)
                 own = "--task", str(task), "--epochs", str(EPOCHS), "--looks", LOOKS
                 suite("study", "new", str(study), *ENTRIES, *own)
+                study.write_text(study.read_text().replace("[[entries]]", f"{QUESTION}[[entries]]", 1))
             studies.append(str(study))
     for study in studies:
         suite("study", "run", study, "--workers", arguments.workers)
