@@ -14,6 +14,7 @@ Like any study, it goes on where it was stopped.
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -28,8 +29,9 @@ ENTRIES = (
     f"network: ddqn mlp width=10 input_scale=5.08 lr=.00193 {OPTIONS}",
     f"sines: ddqn mlp width=10 activation=sin input_scale=8 lr=.00214 {OPTIONS}",
 )
-QUESTION = """[[looks.questions]]
-text = "Does the circuit need fewer steps than every classical model of its size?"
+QUESTION = "Does the circuit need fewer steps than every classical model of its size?"
+PAIRS = f"""[[looks.questions]]
+text = "{QUESTION}"
 pairs = [["circuit", "mean-field"], ["circuit", "network"], ["circuit", "sines"]]
 
 """
@@ -58,21 +60,27 @@ def main() -> None:
     parser.add_argument("--workers", default="2")
     arguments = parser.parse_args()
 
-    def suite(*words: str) -> None:
-        subprocess.run([sys.executable, "-m", "qrlsuite", *words, "--runs", str(arguments.runs)], check=True)
-
-    folder = arguments.runs / "family"
+    folder = arguments.runs.resolve() / "family"
     folder.mkdir(parents=True, exist_ok=True)
+
+    def suite(*words: str) -> None:
+        command = sys.executable, "-m", "qrlsuite", *words, "--runs", str(folder.parent)
+        subprocess.run(command, check=True, cwd=folder)
+
     studies = []
     for antennas in range(2, 6):
         for index in range(5, 10):
-            study = folder / f"family-a{antennas}-{index}.toml"
-            if not study.exists():
-                task = write_task(folder, antennas, index)
-                own = "--task", str(task), "--epochs", str(EPOCHS), "--looks", LOOKS
-                suite("study", "new", str(study), *ENTRIES, *own)
-                study.write_text(study.read_text().replace("[[entries]]", f"{QUESTION}[[entries]]", 1))
-            studies.append(str(study))
+            study = f"family-a{antennas}-{index}.toml"
+            if not (folder / study).exists():
+                task = write_task(folder, antennas, index).name
+                suite(
+                    "study", "new", study, *ENTRIES, "--task", task, "--epochs", str(EPOCHS), "--looks", LOOKS
+                )
+                text = re.sub(
+                    "^summary = .*", f'summary = "{QUESTION}"', (folder / study).read_text(), flags=re.M
+                )
+                (folder / study).write_text(text.replace("[[entries]]", f"{PAIRS}[[entries]]", 1))
+            studies.append(study)
     for study in studies:
         suite("study", "run", study, "--workers", arguments.workers)
     suite("show", *studies)
