@@ -25,6 +25,7 @@ from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting, Table
+from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted
 from qrlsuite.studies.sizes import nearest_size
 
@@ -186,6 +187,7 @@ class StudyFile(Table):
 
     _origin: str = PrivateAttr("")
     _folder: Path | None = PrivateAttr(None)
+    _kept: Path | None = PrivateAttr(None)
     format_version: Literal[1]
     name: Name
     summary: Annotated[str, Field(min_length=1)]
@@ -242,6 +244,25 @@ class StudyFile(Table):
         named._folder = folder.absolute()
         return named
 
+    def kept_in(self, folder: Path) -> StudyFile:
+        """Return the study with the folder of its results, where copies of its task files lie."""
+        kept = self.model_copy()
+        kept._kept = folder
+        return kept
+
+    def task(self, name: str) -> Task:
+        """Load a task of the study: of a task file the copy that lies with the results, if there is one."""
+        copy = None if self._kept is None or not name.endswith(".toml") else self._kept / Path(name).name
+        return load_task(name if copy is None or not copy.is_file() else str(copy))
+
+    def copy_tasks(self, folder: Path) -> None:
+        """Write a copy of each task file that the study names to the folder of its results."""
+        tasks = dict.fromkeys(task for group in self.entries for task in _listed(group.task))
+        for name in tasks:
+            if name.endswith(".toml"):
+                content = self.task(name).file.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+                write_atomically(folder / Path(name).name, tomli_w.dumps(content).encode())
+
     def members(
         self, settings: Sequence[Setting] = (), models: Mapping[str, str] | None = None
     ) -> list[Member]:
@@ -254,7 +275,7 @@ class StudyFile(Table):
         models:
             Models to be used in the place of others, by name.
         """
-        models, task_of = models or {}, functools.cache(load_task)
+        models, task_of = models or {}, functools.cache(self.task)
         named: set[str] = set()
         by_group: dict[str | None, list[Member]] = {}
         every: list[Member] = []
@@ -430,4 +451,4 @@ def load(name: str) -> StudyFile:
 
 def load_kept(path: Path) -> StudyFile:
     """Load the file of a study that lies with its results; these may be a stranger's, so it loads no plugin."""
-    return parse(files.read(path, "study file"), path.name)
+    return parse(files.read(path, "study file"), path.name).kept_in(path.parent)

@@ -720,6 +720,17 @@ def test_a_study_published_before_its_first_seed_keeps_its_file(exported: Path) 
     assert file.read_text().startswith("# committed before the first seed\n")
 
 
+def test_a_published_study_has_a_copy_of_its_task_file(exported: Path, refused: Refused) -> None:
+    [pair] = answer("show", str(exported))["pairs"]
+    Path("tiny.toml").unlink()
+    say("import", str(exported), "--runs", "others")
+    assert Path("others/decisions/p/tiny.toml").read_bytes() == (exported / "tiny.toml").read_bytes()
+    shutil.rmtree("runs")
+    assert answer("show", str(exported))["pairs"] == [pair]
+    (exported / "tiny.toml").unlink()
+    assert "task file tiny.toml cannot be read" in refused("show", str(exported))
+
+
 def test_a_damaged_published_study_is_refused(exported: Path, refused: Refused) -> None:
     edit(str(exported / "plan.toml"), "alpha = 0.05", "alpha = 0.5")
     assert "was not trained by study" in refused("show", str(exported))
