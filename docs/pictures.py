@@ -124,6 +124,10 @@ PICTURES: dict[str, Picture] = {
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
+    "tuning-sensitivity.png": Unpublished(
+        "benchmarks/tuning.py --stored runs/tuning --repetitions 0 --out tuning-sensitivity.png",
+        program="python",
+    ),
     "study-deploy-errors.png": Unpublished(
         "plot errors --study deploy", trained="study run deploy --seeds 20"
     ),

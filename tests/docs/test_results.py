@@ -93,6 +93,10 @@ def test_larger_studies_say_what_readme_and_findings_say() -> None:
         for outcome in tables.several("advantage")
         for pair in outcome.pairs
     }
+    planted = {rival: pairs.pop(("planted", rival)) for rival in ("mean-field", "network", "sines")}
+    assert [round(100 * pair.difference) for pair in planted.values()][:2] == [86, 53]
+    assert "the mean-field control needs 86% more steps, the network 53% more." in FINDINGS
+    assert [max(map(abs, pair.interval)) < 0.06 for pair in planted.values()] == [False, False, True]
     tasks = {task for task, _ in pairs}
     assert tasks == set(tables.SEVEN)
     leads = {key for key, pair in pairs.items() if pair.verdict == "circuit needs fewer"}
