@@ -71,15 +71,20 @@ def main() -> None:
     for antennas in range(2, 6):
         for index in range(5, 10):
             study = f"family-a{antennas}-{index}.toml"
-            if not (folder / study).exists():
-                task = write_task(folder, antennas, index).name
-                suite(
-                    "study", "new", study, *ENTRIES, "--task", task, "--epochs", str(EPOCHS), "--looks", LOOKS
+            path = folder / study
+            if not path.exists():
+                own = (
+                    "--task",
+                    write_task(folder, antennas, index).name,
+                    "--epochs",
+                    str(EPOCHS),
+                    "--looks",
+                    LOOKS,
                 )
-                text = re.sub(
-                    "^summary = .*", f'summary = "{QUESTION}"', (folder / study).read_text(), flags=re.M
-                )
-                (folder / study).write_text(text.replace("[[entries]]", f"{PAIRS}[[entries]]", 1))
+                suite("study", "new", study, *ENTRIES, *own)
+            if PAIRS not in (text := path.read_text()):
+                text = re.sub("^summary = .*", f'summary = "{QUESTION}"', text, flags=re.M)
+                path.write_text(text.replace("[[entries]]", f"{PAIRS}[[entries]]", 1))
             studies.append(study)
     for study in studies:
         suite("study", "run", study, "--workers", arguments.workers)

@@ -41,7 +41,8 @@ BOARDS = ("beam6g", *PAIRS)
 READING = """
 A [study](../decisions.md) fixes its entries, pairs, seeds and error before its first seed is trained, and compares
 after 20 seeds, after 40, and so on. A [board](../compare.md) compares all entries of a task, mostly by 50 seeds, and
-with settings of searches that had no last round. Where a [larger study](advantage.md) asks the same, its answer counts.
+with settings of searches that had no last round. Where a [larger study](advantage.md) asks the same question, its
+answer is the better one.
 
 - *B against A* is how many more steps B needs, as a mean over the task's thresholds: +52% means that B is slower. Each
   threshold is tested separately. Where the interval of a decided pair includes 0, the threshold that decided follows

@@ -143,7 +143,11 @@ def draw_together(together: StudiesTogether) -> Figure:
         heads.append(len(names))
         names.append(f"{shared.first} / {shared.second}")
         for each, pairs in zip(studies, found):
-            pair = pairs.get((shared.first, shared.second)) or _reversed(pairs[shared.second, shared.first])
+            pair = pairs.get((shared.first, shared.second))
+            if pair is None and (shared.second, shared.first) in pairs:
+                pair = _reversed(pairs[shared.second, shared.first])
+            if pair is None:  # of a task that is not averaged
+                continue
             ends += _row(axes, len(names), pair)
             shown.append(pair)
             made = f", made for {each.study.made_for} models" if each in together.controls else ""

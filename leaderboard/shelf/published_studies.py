@@ -1,7 +1,6 @@
 """Published studies with looks: the study, its log of looks, and the learning curves of its entries.
 
     <name>/plan.toml                the study as it was when its first seed began
-           <task>.toml              a copy of its task file, if its task is not registered
            looks.jsonl              times of the first seed and of each look, and the look's results
            <task>/<entry>/...       like published entries, see `qrlsuite.leaderboard.shelf.published`
 
@@ -132,7 +131,6 @@ def export(study: Study, out: Path, agents: bool = True) -> Path:
         raise OptionError(
             f"{folder} holds another study ({there}, this one is {study.hash}): choose another --out"
         )
-    study.file.copy_tasks(folder)
     for name, entry in study.entries.items():
         held = collect.read_entry(EntryStore.find(study.folder, entry)) if state.seeds[name] else None
         finished = None if held is None else held.reaching(study.epochs)

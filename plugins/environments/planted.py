@@ -7,8 +7,8 @@ Source of the idea: Jerbi et al., "Parametrized quantum policies for reinforceme
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
-from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
@@ -54,17 +54,23 @@ class PlantedOptions:
     steps: Annotated[int, Field(ge=1, le=10_000, description="steps of an episode")] = 20
 
 
-@cache
+_own = threading.local()
+"""The hidden circuit of each thread: a simulator is not to be shared between threads."""
+
+
 def teacher() -> Callable[[torch.Tensor], torch.Tensor]:
     """Return the hidden circuit: a function of points (N, 2) that returns <Z> of both qubits, (N, 2)."""
     import torch
 
-    run = create_backend("native", ansatz("cx", QUBITS, LAYERS))
-    state = {
-        "scaling": torch.tensor([SCALING], dtype=torch.float64),
-        "weights": torch.tensor([WEIGHTS], dtype=torch.float64),
-    }
-    return lambda points: run(points[None], state, None)[0]
+    if not hasattr(_own, "teacher"):
+        run = create_backend("native", ansatz("cx", QUBITS, LAYERS))
+        state = {
+            "scaling": torch.tensor([SCALING], dtype=torch.float64),
+            "weights": torch.tensor([WEIGHTS], dtype=torch.float64),
+        }
+        _own.teacher = lambda points: run(points[None], state, None)[0]
+    made: Callable[[torch.Tensor], torch.Tensor] = _own.teacher
+    return made
 
 
 def classify(points: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -5,7 +5,6 @@ of seeds the results are looked at, and at which error (`qrlsuite.statistics.seq
 own, in a folder of its own:
 
     <runs>/decisions/<name>/plan.toml           the study as it was when its first seed began
-                            <task>.toml         a copy of its task file, if its task is not registered
                             looks.jsonl         times of the first seed and of each look, and the look's results
                             <task>/<entry>/...  as in any results folder; each seed's record has the study's hash
 
@@ -226,7 +225,6 @@ class Study:
                 f"{self.source}: the study was ended on {when}; a new one needs a name of its own"
             )
         if not begun:
-            self.file.copy_tasks(self.folder)
             write_atomically(self.folder / FILE, dumps(self.file).encode())
             if self._begun_at(log) is None:
                 block = [self.looks.block.start, self.looks.block.stop]

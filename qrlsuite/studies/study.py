@@ -24,8 +24,9 @@ from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.script import SCRIPT
 from qrlsuite.experiment.task import Task
 from qrlsuite.experiment.task import load as load_task
+from qrlsuite.experiment.task import parse as parse_task
 from qrlsuite.options import Setting, Table
-from qrlsuite.results.store import write_atomically
+from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import counted
 from qrlsuite.studies.sizes import nearest_size
 
@@ -245,23 +246,22 @@ class StudyFile(Table):
         return named
 
     def kept_in(self, folder: Path) -> StudyFile:
-        """Return the study with the folder of its results, where copies of its task files lie."""
+        """Return the study with the folder of its results, whose entries have its tasks, too."""
         kept = self.model_copy()
         kept._kept = folder
         return kept
 
-    def task(self, name: str) -> Task:
-        """Load a task of the study: of a task file the copy that lies with the results, if there is one."""
-        copy = None if self._kept is None or not name.endswith(".toml") else self._kept / Path(name).name
-        return load_task(name if copy is None or not copy.is_file() else str(copy))
+    def _recorded(self, name: str, hash: str | None) -> Task | None:
+        """Read an entry's task file from the results, if there are any.
 
-    def copy_tasks(self, folder: Path) -> None:
-        """Write a copy of each task file that the study names to the folder of its results."""
-        tasks = dict.fromkeys(task for group in self.entries for task in _listed(group.task))
-        for name in tasks:
-            if name.endswith(".toml"):
-                content = self.task(name).file.model_dump(mode="json", exclude_unset=True, exclude_none=True)
-                write_atomically(folder / Path(name).name, tomli_w.dumps(content).encode())
+        They may be a stranger's, so no task file loads a plugin here.
+        """
+        if self._kept is None or not name.endswith(".toml"):
+            return None
+        for path in sorted(self._kept.glob("*/*/entry.json")):
+            if hash is not None and path.parent.name.endswith(f"-{hash[:8]}"):
+                return EntryStore(path.parent).entry().task
+        return parse_task(files.read(Path(name), "task file"), name)
 
     def members(
         self, settings: Sequence[Setting] = (), models: Mapping[str, str] | None = None
@@ -275,7 +275,7 @@ class StudyFile(Table):
         models:
             Models to be used in the place of others, by name.
         """
-        models, task_of = models or {}, functools.cache(self.task)
+        models, task_of = models or {}, functools.cache(load_task)
         named: set[str] = set()
         by_group: dict[str | None, list[Member]] = {}
         every: list[Member] = []
@@ -286,8 +286,9 @@ class StudyFile(Table):
             try:
                 for draft, target in itertools.product(_drafts(group), targets):
                     named.add(draft.written.model)
-                    # a script may define a task that nothing else knows
-                    task = draft.task if draft.written.algorithm == SCRIPT else task_of(draft.task)
+                    task: Task | str | None = self._recorded(draft.task, group.hash)
+                    if task is None:  # a script may define a task that nothing else knows
+                        task = draft.task if draft.written.algorithm == SCRIPT else task_of(draft.task)
                     member = _member(group, draft, task, settings, models, target, used)
                     member = replace(member, entry=replace(member.entry, folder=self._folder))
                     members.setdefault((member.entry.task.name, member.entry.name), member)
@@ -446,7 +447,8 @@ def dumps(file: StudyFile) -> str:
 def load(name: str) -> StudyFile:
     """Load a registered study by name, or a study file by path (anything that ends in `.toml`), with its plugins."""
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
-    return parse(files.read(path, "study file"), path.name, path.parent).started_in(path.parent)
+    file = parse(files.read(path, "study file"), path.name, path.parent).started_in(path.parent)
+    return file.kept_in(path.parent) if any(path.parent.glob("*/*/entry.json")) else file
 
 
 def load_kept(path: Path) -> StudyFile:

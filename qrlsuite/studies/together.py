@@ -218,12 +218,12 @@ class StudiesTogether(Shown):
 def together(studies: Sequence[State]) -> StudiesTogether:
     """Compare the pairs that several studies share, on average over their tasks.
 
-    Tasks that were made for one kind of model are left out of means and claims, unless fewer than two others remain.
+    Tasks that were made for one kind of model are left out of means and claims.
 
     Raises
     ------
     OptionError
-        If two studies have one task, one lacks its first look, or they share no pair.
+        If two studies have one task, one lacks its first look, they share no pair, or fewer than two are averaged.
     """
     seen: set[str] = set()
     for each in studies:
@@ -236,8 +236,10 @@ def together(studies: Sequence[State]) -> StudiesTogether:
             raise OptionError(f"study '{name}' has not taken its first look: qrlsuite study run {name}")
     counted = [each for each in studies if not each.study.made_for]
     if len(counted) < 2:
-        counted = list(studies)
-    pairs, ratios, left_out = list(_shared(studies)), list[tuple[str, str, str, MeanRatio]](), list[str]()
+        raise OptionError(
+            "a mean over tasks needs two tasks or more that were not made for one kind of model"
+        )
+    pairs, ratios, left_out = list(_shared(counted)), list[tuple[str, str, str, MeanRatio]](), list[str]()
     if not pairs:
         names = listed([each.study.name for each in studies])
         raise OptionError(

@@ -720,15 +720,22 @@ def test_a_study_published_before_its_first_seed_keeps_its_file(exported: Path) 
     assert file.read_text().startswith("# committed before the first seed\n")
 
 
-def test_a_published_study_has_a_copy_of_its_task_file(exported: Path, refused: Refused) -> None:
+def test_a_published_study_is_read_without_its_task_file(exported: Path, refused: Refused) -> None:
     [pair] = answer("show", str(exported))["pairs"]
     Path("tiny.toml").unlink()
-    say("import", str(exported), "--runs", "others")
-    assert Path("others/decisions/p/tiny.toml").read_bytes() == (exported / "tiny.toml").read_bytes()
     shutil.rmtree("runs")
     assert answer("show", str(exported))["pairs"] == [pair]
-    (exported / "tiny.toml").unlink()
+    say("import", str(exported), "--runs", "others")
+    assert answer("study", "run", str(exported / "plan.toml"), "--runs", "others")["pairs"] == [pair]
+    for entry in exported.glob("tiny/*"):
+        shutil.rmtree(entry)
     assert "task file tiny.toml cannot be read" in refused("show", str(exported))
+    Path("evil.py").write_text("raise SystemExit('code of a stranger ran')")
+    Path("tiny.toml").write_text(f'plugins = ["evil.py"]\n{TINY}')
+    assert "add --plugin evil.py" in refused("show", str(exported))
+    file = exported / "plan.toml"
+    file.write_text(re.sub("^hash = .*", "", file.read_text(), flags=re.M))
+    assert "add --plugin evil.py" in refused("show", str(exported))
 
 
 def test_a_damaged_published_study_is_refused(exported: Path, refused: Refused) -> None:
