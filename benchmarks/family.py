@@ -73,15 +73,9 @@ def main() -> None:
             study = f"family-a{antennas}-{index}.toml"
             path = folder / study
             if not path.exists():
-                own = (
-                    "--task",
-                    write_task(folder, antennas, index).name,
-                    "--epochs",
-                    str(EPOCHS),
-                    "--looks",
-                    LOOKS,
-                )
-                suite("study", "new", study, *ENTRIES, *own)
+                task = write_task(folder, antennas, index).name
+                own = f"--task {task} --epochs {EPOCHS}".split()
+                suite("study", "new", study, *ENTRIES, *own, "--looks", LOOKS)
             if PAIRS not in (text := path.read_text()):
                 text = re.sub("^summary = .*", f'summary = "{QUESTION}"', text, flags=re.M)
                 path.write_text(text.replace("[[entries]]", f"{PAIRS}[[entries]]", 1))

@@ -150,8 +150,8 @@ def draw_together(together: StudiesTogether) -> Figure:
                 continue
             ends += _row(axes, len(names), pair)
             shown.append(pair)
-            made = f", made for {each.study.made_for} models" if each in together.controls else ""
-            names.append(each.study.task + made)
+            made_for = each.study.made_for
+            names.append(each.study.task + (f", made for {made_for} models" if made_for else ""))
         ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *shared.ratio.interval))
         axes.plot([low, high], [len(names)] * 2, color="black", lw=1.6)
         axes.plot([ratio], [len(names)], "*", color="black", ms=9)

@@ -252,9 +252,9 @@ class StudyFile(Table):
         return kept
 
     def _recorded(self, name: str, hash: str | None) -> Task | None:
-        """Read an entry's task file from the results, if there are any.
+        """Return the task of an entry whose task is a file, from the results; None without results.
 
-        They may be a stranger's, so no task file loads a plugin here.
+        The results may be a stranger's, so no task file loads a plugin here.
         """
         if self._kept is None or not name.endswith(".toml"):
             return None

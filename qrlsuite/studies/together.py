@@ -259,7 +259,7 @@ def together(studies: Sequence[State]) -> StudiesTogether:
         SharedPair(asked, first, second, replace(ratio, p=p, drawn_p=other))
         for (asked, first, second, ratio), p, other in zip(ratios, adjusted, drawn)
     )
-    controls = tuple(each for each in studies if each not in counted)
+    controls = tuple(each for each in studies if each.study.made_for)
     return StudiesTogether(tuple(counted), controls, found, tuple(left_out), dict(_claims(counted)))
 
 

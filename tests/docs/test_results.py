@@ -132,8 +132,8 @@ def test_larger_studies_say_what_readme_and_findings_say() -> None:
     assert max(excluded) < 0.1
     assert (
         "beats the ReLU network on all seven tasks, and its mean-field control on four, by 7 to 13 percent. 3. Sines "
-        "beat the circuit on two tasks, and by 5.5 percent on average over the seven. On `pulse` alone the circuit "
-        "beats all three, by 2 to 7 percent" in README
+        "beat the circuit on two tasks. On `pulse` alone the circuit beats all three, by 2 to 7 percent"
+        in README
     )
     assert "for seven tasks, we can show it [on none of them]" in README
     assert "shown to beat all three [on none of them]" in FINDINGS
