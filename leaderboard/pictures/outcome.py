@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, listed
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.results.text import steps_text
+from qrlsuite.statistics.across import DRAWN
 from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.studies import state as outcomes
 from qrlsuite.studies.state import State
-from qrlsuite.studies.together import StudiesTogether
+from qrlsuite.studies.together import OVER_SUCH, StudiesTogether
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -134,7 +135,7 @@ def draw_together(together: StudiesTogether) -> Figure:
         raise OptionError(f"no pair has a mean over the tasks: {'; '.join(together.left_out)}")
     studies = (*together.studies, *together.controls)
     found = [{(pair.first, pair.second): pair for pair in each.pairs} for each in studies]
-    height = 1.4 + 0.25 * len(together.pairs) * (len(studies) + 2)
+    height = 1.4 + 0.25 * len(together.pairs) * (len(studies) + 2 + (len(together.studies) >= DRAWN))
     figure = Figure(figsize=(9.5, height), layout="constrained")
     axes = figure.subplots()
     names: list[str] = []
@@ -152,11 +153,15 @@ def draw_together(together: StudiesTogether) -> Figure:
             shown.append(pair)
             made_for = each.study.made_for
             names.append(each.study.task + (f", made for {made_for} models" if made_for else ""))
-        ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *shared.ratio.interval))
-        axes.plot([low, high], [len(names)] * 2, color="black", lw=1.6)
-        axes.plot([ratio], [len(names)], "*", color="black", ms=9)
-        ends += [low, high]
-        names.append(f"mean of {len(together.studies)} tasks: {shared.verdict}")
+        means = [(shared.ratio.interval, f"mean of {len(together.studies)} tasks: {shared.verdict}")]
+        if len(together.studies) >= DRAWN:
+            means.append((shared.ratio.drawn_interval, f"over such tasks: {shared.drawn_verdict}"))
+        for interval, name in means:
+            ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *interval))
+            axes.plot([low, high], [len(names)] * 2, color="black", lw=1.6)
+            axes.plot([ratio], [len(names)], "*", color="black", ms=9)
+            ends += [low, high]
+            names.append(name)
     margins = {each.study.looks.margin for each in studies}
     shade = margins.pop() if len(margins) == 1 else None
     _ratios(axes, ends, shade or 0.0)
@@ -168,13 +173,14 @@ def draw_together(together: StudiesTogether) -> Figure:
     axes.plot([], [], "*", color="black", ms=9, label="mean over the tasks")
     _finish(
         figure,
-        f"{len(studies)} tasks: {studies[0].study.name} and {len(studies) - 1} more",
+        f"{len(studies)} tasks: {listed([each.study.name for each in studies], 1)}",
         "tasks: each study's verdicts and repeated confidence intervals, which hold for all of its pairs and looks; "
         "right: seeds of each entry at the pair's last look",
         "equality is tested for each pair by itself; an early stop overstates the difference",
         _open_markers(shown),
         "mean: of the ratios, by the first look's seeds of each study, with a 95 percent interval by itself; the "
         "verdict holds for all pairs",
+        OVER_SUCH if len(together.studies) >= DRAWN else "",
         "" if shade is None else f"shaded: equal within {100 * shade:g} percent",
         *(f"left out: {line}" for line in together.left_out),
         f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, shown)) else "",

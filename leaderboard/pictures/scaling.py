@@ -16,7 +16,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.errors import OptionError, nearest
+from qrlsuite.errors import OptionError, listed, nearest
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
@@ -203,8 +203,7 @@ def _not_shown(entries: Sequence[EntryResults], panels: Sequence[_Panel]) -> str
     """Name the entries that are on no line, for lack of others of their kind."""
     shown = {id(entry) for panel in panels for line in panel.lines for _, entry in line.members}
     missing = [style.plain(entry.label) for entry in entries if id(entry) not in shown]
-    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-    return f"not shown, too few of a kind for a line: {', '.join(missing[:3])}{more}" if missing else ""
+    return f"not shown, too few of a kind for a line: {listed(missing, 3)}" if missing else ""
 
 
 def _sizes(panels: Sequence[_Panel]) -> str:

@@ -126,7 +126,7 @@ class Sheet:
             width = self._width(column)
             room = max(width, self._least(column) + spare if column.bar else 0)
             title = column.title
-            lines = [title] if column.words else textwrap.wrap(title, room, break_long_words=False)
+            lines = [title] if column.words else _wrapped(title, room)
             justify: Literal["left", "right"] = "left" if column.words or column.bar else "right"
             table.add_column(
                 Text("\n".join(lines)), justify=justify, overflow="fold", no_wrap=not column.words
@@ -142,9 +142,9 @@ class Sheet:
         return table
 
     def _width(self, column: Column[Any]) -> int:
-        """Return the characters that a column needs: of its longest cell, or of the longest word of its head."""
+        """Return the characters that a column needs: of its longest cell, or of the longest part of its head."""
         place = self.columns.index(column)
-        return max(map(len, (*(row[place] for row in self.cells), *column.title.replace("-", "- ").split())))
+        return max(map(len, (*(row[place] for row in self.cells), *_wrapped(column.title, 1))))
 
     def _least(self, column: Column[Any]) -> int:
         """Return the characters that a column needs with its bars, and with its words folded."""
@@ -222,6 +222,11 @@ class Sheet:
                 "",
             ]
         )
+
+
+def _wrapped(title: str, room: int) -> list[str]:
+    """Return the lines of a head; names such as `beam6g-a2-0` are not broken."""
+    return textwrap.wrap(title, room, break_long_words=False)
 
 
 WRITTEN = {".tex": Sheet.latex, ".md": Sheet.markdown}

@@ -28,6 +28,9 @@ from qrlsuite.studies.state import State, by_question
 
 ALPHA = 0.05
 """Probability of any false difference, over all pairs."""
+SHOWN = 8
+"""Studies that the title of a table names."""
+OVER_SUCH = "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at random"
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,22 +187,21 @@ class StudiesTogether(Shown):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show a table for each question, with explanations."""
-        names = ", ".join(each.study.name for each in self.studies)
+        counts = ", ".join(map(str, self.seeds if len({*self.seeds}) > 1 else self.seeds[:1]))
+        names = listed([each.study.name for each in self.studies], SHOWN)
         yield Text(f"{names}: B against A, on each task and on average", style="bold")
         for sheet in self.sheets():
             yield from [Text(sheet.title, style="bold")] * bool(sheet.title)
             yield replace(sheet, title="")
         yield Text(
             "B against A: how many more steps B needs (+52% = B is slower), by the first look's seeds of each study "
-            f"({', '.join(map(str, self.seeds))}), which no early stop can bias; mean: of the ratios, over these "
+            f"({counts}), which no early stop can bias; mean: of the ratios, over these "
             f"{len(self.tasks)} tasks, with a 95% interval by itself; one left out: the least and the greatest mean "
             f"without one of the tasks; verdict: error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). "
             "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
         )
         if len(self.studies) >= DRAWN:
-            yield Text(
-                "over such tasks: the conclusion for all tasks, if these tasks were drawn from them at random."
-            )
+            yield Text(f"{OVER_SUCH}.")
         yield from map(Text, self.claim_lines)
         for each in self.controls:
             yield Text(

@@ -39,6 +39,15 @@ def test_the_spread_between_seeds_is_in_every_format() -> None:
     assert cut == pytest.approx([low, 40_000]), "the curves of a board end at its horizon"
 
 
+def test_a_head_that_cannot_be_broken_costs_the_last_columns_not_the_first_ones() -> None:
+    heads = ["pair", *(f"beam6g-a2-{place}-degree5" for place in range(9))]
+    console = Console(width=80, file=io.StringIO())
+    console.print(Sheet.of("", heads, [["circuit / network", *["+1.4%"] * 9]], words=["pair"]))
+    head, _, row = console.file.getvalue().splitlines()
+    assert head.split() == heads[:4]
+    assert row.split() == ["circuit", "/", "network", *["+1.4%"] * 3]
+
+
 def test_a_made_up_column_is_written_by_every_writer() -> None:
     rows: list[Any] = [["a|b", 0.25, 1, 2], ["c", None]]
     columns: list[Column[Any]] = [
