@@ -13,7 +13,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from qrlsuite.errors import OptionError, listed
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics.across import DRAWN
 from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.studies import state as outcomes
 from qrlsuite.studies.state import State
@@ -135,7 +134,7 @@ def draw_together(together: StudiesTogether) -> Figure:
         raise OptionError(f"no pair has a mean over the tasks: {'; '.join(together.left_out)}")
     studies = (*together.studies, *together.controls)
     found = [{(pair.first, pair.second): pair for pair in each.pairs} for each in studies]
-    height = 1.4 + 0.25 * len(together.pairs) * (len(studies) + 2 + (len(together.studies) >= DRAWN))
+    height = 1.4 + 0.25 * len(together.pairs) * (len(studies) + 2 + together.over_such)
     figure = Figure(figsize=(9.5, height), layout="constrained")
     axes = figure.subplots()
     names: list[str] = []
@@ -154,7 +153,7 @@ def draw_together(together: StudiesTogether) -> Figure:
             made_for = each.study.made_for
             names.append(each.study.task + (f", made for {made_for} models" if made_for else ""))
         means = [(shared.ratio.interval, f"mean of {len(together.studies)} tasks: {shared.verdict}")]
-        if len(together.studies) >= DRAWN:
+        if together.over_such:
             means.append((shared.ratio.drawn_interval, f"over such tasks: {shared.drawn_verdict}"))
         for interval, name in means:
             ratio, low, high = (_within(1 + end) for end in (shared.ratio.difference, *interval))
@@ -180,7 +179,7 @@ def draw_together(together: StudiesTogether) -> Figure:
         _open_markers(shown),
         "mean: of the ratios, by the first look's seeds of each study, with a 95 percent interval by itself; the "
         "verdict holds for all pairs",
-        OVER_SUCH if len(together.studies) >= DRAWN else "",
+        OVER_SUCH * together.over_such,
         "" if shade is None else f"shaded: equal within {100 * shade:g} percent",
         *(f"left out: {line}" for line in together.left_out),
         f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, shown)) else "",

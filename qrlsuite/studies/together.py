@@ -104,6 +104,11 @@ class StudiesTogether(Shown):
         return tuple(each.study.design.looks[0] for each in self.studies)
 
     @property
+    def over_such(self) -> bool:
+        """Whether the tasks are enough for a conclusion about further tasks like them."""
+        return len(self.studies) >= DRAWN
+
+    @property
     def changed(self) -> list[str]:
         """The entries of shared pairs whose options are not the same on all tasks, in order."""
         names = dict.fromkeys(name for pair in self.pairs for name in (pair.first, pair.second))
@@ -151,7 +156,7 @@ class StudiesTogether(Shown):
             Column("difference", lambda pair: pair.ratio.difference, head="mean (95%)", cell=mean),
             Column("interval", lambda pair: list(pair.ratio.interval)),
             Column("p", lambda pair: pair.ratio.p, p_text),
-            *(over_such * (len(self.studies) >= DRAWN)),
+            *(over_such * self.over_such),
             Column("left_out", lambda pair: list(pair.ratio.left_out), _span, head="one left out"),
             Column("differences", lambda pair: dict(zip(self.tasks, pair.ratio.differences))),
             *(on(place, task) for place, task in enumerate(self.tasks)),
@@ -200,7 +205,7 @@ class StudiesTogether(Shown):
             f"without one of the tasks; verdict: error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). "
             "Tasks are fixed, only seeds are drawn: nothing follows for other tasks."
         )
-        if len(self.studies) >= DRAWN:
+        if self.over_such:
             yield Text(f"{OVER_SUCH}.")
         yield from map(Text, self.claim_lines)
         for each in self.controls:

@@ -116,6 +116,13 @@ def test_the_mean_of_many_tasks_is_that_of_tasks_like_them(monkeypatch: pytest.M
     )
     assert "the conclusion for all tasks" in " ".join(repr(read).split())
     assert read.as_dict()["pairs"][0]["drawn_interval"] == list(read.pairs[0].ratio.drawn_interval)
+    [axes] = drawing.draw_together(read).axes
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}
+    size = len(TOGETHER) + 3
+    for row, pair in zip(range(size - 1, len(names), size), read.pairs, strict=True):
+        assert names[row] == f"over such tasks: {pair.drawn_verdict}"
+        assert lines[row].get_xdata() == pytest.approx([1 + end for end in pair.ratio.drawn_interval])
 
 
 def test_a_task_that_was_made_for_one_model_is_drawn_and_counts_in_no_mean() -> None:

@@ -53,8 +53,12 @@ CHANGING = (
     (r"\bwith \d+ workers?\b", "with N workers"),
     (r"\b[\d.]+ (k|M|G|T)?B\b", "N B"),
     (r"\b\d{5,}(?=%)", "N"),
+    (r"median score [\d.]+ after epoch 2000", "median score N after epoch 2000"),
 )
-"""What is replaced in what is printed, and by what: times, sizes, processes."""
+"""What is replaced in what is printed, and by what: times, sizes, processes.
+
+After 2000 epochs, the score depends on how the processor's vectors round.
+"""
 PROGRESS = re.compile(
     r"seeds \d+/\d+  epoch |about [\d.]+ ?\w+ left|qrlsuite: compiling |one round of |faster: fewer "
 )
