@@ -24,7 +24,7 @@ from typing import Any
 
 from PIL import Image, ImageSequence
 from PIL.PngImagePlugin import PngInfo
-from tables import PAIRS, ROOT, TOGETHER, short_names
+from tables import FAMILY, PAIRS, ROOT, TOGETHER, short_names
 
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import AGENTS, encode_record
@@ -158,10 +158,15 @@ PICTURES: dict[str, Picture] = {
     "study-fig7-scaling.png": Plot("plot scaling --study fig7 --published --seeds 30", ("entries/beam6g/*",)),
     **{
         f"study-{name}-tasks.png": Plot(
-            f"plot pairs {' '.join(f'--study {each}' for each in TOGETHER[name])}",
-            tuple(f"plans/{each}{below}" for each in TOGETHER[name] for below in ("", "/*/*")),
+            f"plot pairs {' '.join(f'--study {place}{each}' for each in TOGETHER[name])}",
+            tuple(f"{folder}/{each}{below}" for each in TOGETHER[name] for below in ("", "/*/*")),
         )
-        for name in ("advantage", "equal-size", "equal-size-ppo")
+        for name, folder, place in (
+            ("advantage", "plans", ""),
+            ("equal-size", "plans", ""),
+            ("equal-size-ppo", "plans", ""),
+            (FAMILY, FAMILY, f"leaderboard/{FAMILY}/"),
+        )
     },
     "study-ppo-bars.png": Plot("plot bars --study ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
     "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),

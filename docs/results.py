@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 
 from tables import (
+    FAMILY,
     PAIRS,
     ROOT,
     TOGETHER,
@@ -23,11 +24,13 @@ from tables import (
     of_several,
     pairs,
     published,
+    rivals,
     settings,
     verdicts,
 )
 
 from qrlsuite.api.needs import study_power
+from qrlsuite.errors import listed
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.text import hours_text
@@ -193,6 +196,12 @@ def of_tasks(name: str) -> str:
     judgment, notes = judged(name)
     summary = asked.studies[0].study.file.summary
     links = ", ".join(f"[`{each}`]({each}.md)" for each in TOGETHER[name])
+    studies = " ".join(TOGETHER[name])
+    if name == FAMILY:
+        links, studies = (
+            f"`leaderboard/{FAMILY}`, written by `benchmarks/family.py`",
+            f"leaderboard/{FAMILY}/*",
+        )
     picture = f"![{summary}](../images/study-{name}-tasks.png)" if name != "quantum-or-not-elsewhere" else ""
     shared = means(name) if name != "quantum-or-not-elsewhere" else ()
     return _page(
@@ -200,10 +209,13 @@ def of_tasks(name: str) -> str:
         f"**{summary}** Studies: {links}.",
         judgment,
         picture,
-        _code(f"qrlsuite show {' '.join(TOGETHER[name])}"),
+        _code(f"qrlsuite show {studies}"),
         f"Steps below threshold, mean over seeds and thresholds:\n\n{markdown(shared)}" if shared else "",
         f"The mean over tasks, from the first look of each study:\n\n{markdown(of_several(name))}",
         "\n".join(f"- {line}" for line in asked.claim_lines),
+        f"Each task, with the interval of its own study:\n\n{markdown(rivals(name))}"
+        if name == FAMILY
+        else "",
         _folded("Notes", notes),
     )
 
@@ -242,7 +254,7 @@ def index() -> str:
         )
         for name in names()
     ]
-    several = [(f"[{name}]({name}.md)", ", ".join(members)) for name, members in TOGETHER.items()]
+    several = [(f"[{name}]({name}.md)", listed(members, 8)) for name, members in TOGETHER.items()]
     boards = []
     for task in BOARDS:
         facts = main_facts(task)
@@ -250,7 +262,7 @@ def index() -> str:
         boards.append(
             (f"[{task}](board-{task}.md)", str(len(facts["rows"])), decided, tasks.load(task).file.summary)
         )
-    families = len(rows) + len(boards)
+    families = len(rows) + len(boards) + len(TOGETHER[FAMILY])
     return _page(
         "Results",
         "One page for each study and board that comes with the suite, made from its files. [Findings](../findings.md) "

@@ -96,13 +96,20 @@ def entries(outcome: State) -> Rows:
 
 SEVEN = ("beam6g", "beam6g-degree5", "beam6g-a3-0", "cartpole", "frozenlake", "vqe-h2", "pulse")
 _BEGUN = published_studies.names(begun=True)
+FAMILY = "family"
+"""The studies of `benchmarks/family.py`, in a folder of their own: no list and no page names each of them."""
 TOGETHER: dict[str, tuple[str, ...]] = {
     "advantage": tuple(name for task in (*SEVEN, "planted") if (name := f"advantage-{task}") in _BEGUN),
     "equal-size": tuple(f"equal-size-{task}" for task in SEVEN),
     "equal-size-ppo": ("equal-size-beam6g-ppo", "equal-size-cartpole-ppo"),
     "quantum-or-not-elsewhere": ("quantum-or-not-degree5", "quantum-or-not-a3-0"),
+    FAMILY: tuple(sorted(path.name for path in (ROOT / "leaderboard" / FAMILY).iterdir())),
 }
 """Studies of one question on several tasks, by the name of their page."""
+
+
+MOST_TASKS = 8
+"""Tasks that are columns of a table."""
 
 
 def several(names: str) -> list[State]:
@@ -119,8 +126,11 @@ def of_several(names: str) -> Rows:
     """The pairs that several studies share, on average over their tasks."""
     read = averaged(names)
     sheet = Sheet("", read.columns(), read.pairs)
-    yield [column.title for column in sheet.columns]
-    yield from sheet.cells
+    shown = len(sheet.columns)
+    if len(read.tasks) > MOST_TASKS:
+        shown -= len(read.tasks)  # the last columns
+    yield [column.title for column in sheet.columns[:shown]]
+    yield from (cells[:shown] for cells in sheet.cells)
 
 
 def means(names: str) -> Rows:
@@ -287,7 +297,8 @@ def _padded(cell: str) -> str:
 @cache
 def published(name: str) -> State:
     """Return what a published study has decided."""
-    return published_studies.read(published_studies.PUBLISHED / name)
+    in_family = ROOT / "leaderboard" / FAMILY / name
+    return published_studies.read(in_family if in_family.is_dir() else published_studies.PUBLISHED / name)
 
 
 @cache

@@ -15,7 +15,9 @@ from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard.shelf.published import AGENTS, CURVES, SEEDS
 from qrlsuite.studies.looks import FILE, LOG
 
-PLACES = ("leaderboard/entries", "leaderboard/unranked", "leaderboard/plans")
+OF_ENTRIES = "leaderboard/entries", "leaderboard/unranked"
+OF_STUDIES = "leaderboard/plans", "leaderboard/family"
+PLACES = *OF_ENTRIES, *OF_STUDIES
 """A repository's folders of published files."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9+._-]*")
@@ -46,7 +48,7 @@ def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
             raise QrlSuiteError(f"{name!r}: {problem}; refused, nothing was verified")
         if not problem:
             folders.add(path.parent)
-    studies = {folder for folder in folders if folder.parent == root / PLACES[2]}
+    studies = {folder for folder in folders if folder.parent in [root / place for place in OF_STUDIES]}
     return sorted(folders - studies), sorted(studies)
 
 
@@ -81,7 +83,7 @@ def _problem(root: Path, name: str) -> str | None:
         return f"{strange!r} is no valid name: use a-z, 0-9, '+', '.', '_' and '-'"
     if any((root / part).is_symlink() for part in [name, *map(str, Path(name).parents)]):
         return "it is a link, or behind one"
-    of_study = place == PLACES[2]
+    of_study = place in OF_STUDIES
     files = {
         2: () if of_study else _OF_ENTRY,
         3: _OF_ENTRY if of_study else (),

@@ -231,3 +231,13 @@ def test_seeds_that_learned_are_those_of_the_study() -> None:
         (0, 40),
     ]
     assert re.search(r"21 of 80 seeds with five layers reach 0.6, 5 of 40 with two, none with one", notes)
+
+
+def test_the_family_says_what_findings_say() -> None:
+    read = tables.averaged(tables.FAMILY)
+    assert len(read.tasks) == 20
+    assert [round(100 * pair.ratio.difference, 1) for pair in read.pairs] == [2.6, 4.2, 0.0]
+    assert {pair.drawn_verdict for pair in read.pairs} == {"not told apart"}
+    assert all(low < 0 < high for low, high in (pair.ratio.drawn_interval for pair in read.pairs))
+    said = "control needs 2.6 percent more steps than the circuit, the network 4.2 and the sines as many."
+    assert said in FINDINGS

@@ -117,7 +117,8 @@ def _pairs() -> Iterator[str]:
 
 
 def _studies_shown() -> Iterator[str]:
-    yield from (f"show {words} --published" for words in (*_studies(), *TOGETHER))
+    family = " ".join(f"leaderboard/family/{name}" for name in _names("family"))
+    yield from (f"show {words} --published" for words in (*_studies(), *TOGETHER, family))
 
 
 def _entries_shown() -> Iterator[str]:
@@ -126,7 +127,7 @@ def _entries_shown() -> Iterator[str]:
 
 
 def _folders_verified() -> Iterator[str]:
-    for folder in ("entries", "unranked", "plans"):
+    for folder in ("entries", "unranked", "plans", "family"):
         yield from (f"verify leaderboard/{folder}/{name}" for name in _names(folder))
 
 

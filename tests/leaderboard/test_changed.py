@@ -83,6 +83,7 @@ def test_a_folder_named_like_a_command_is_refused_and_runs_nothing(repository: P
         ),
         ("leaderboard/unranked/$(id)/x/entry.json", "is no valid name"),
         ("leaderboard/plans/$(id)/plan.toml", "is no valid name"),
+        ("leaderboard/family/$(id)/plan.toml", "is no valid name"),
         ("leaderboard/entries/beam6g/entry.json", "holds TASK/ENTRY/"),
         ("leaderboard/entries/beam6g/x/more/entry.json", "holds TASK/ENTRY/"),
         ("leaderboard/entries/beam6g/x/conftest.py", "holds TASK/ENTRY/"),
@@ -128,13 +129,14 @@ def test_what_differs_is_found(repository: Path) -> None:
     assert changed("HEAD", repository) == ([], [])
     propose(repository, "leaderboard/unranked/beam6g+7d1167f1/one/curves.parquet")
     propose(repository, f"leaderboard/plans/{PLAN}/plan.toml")
+    propose(repository, "leaderboard/family/one/looks.jsonl")
     (repository / "leaderboard/plans/new/task/entry").mkdir(parents=True)
     (repository / "leaderboard/plans/new/task/entry/entry.json").touch()
     (repository / PLACE / "seeds.parquet").unlink()
-    entries, plans = changed("HEAD~2", repository / "leaderboard")
+    entries, plans = changed("HEAD~3", repository / "leaderboard")
     added = ["leaderboard/plans/new/task/entry", "leaderboard/unranked/beam6g+7d1167f1/one"]
     assert [str(path.relative_to(repository)) for path in entries] == [PLACE, *added]
-    assert [path.name for path in plans] == [PLAN]
+    assert [path.name for path in plans] == ["one", PLAN]
 
 
 def test_a_badly_named_file_can_be_removed(repository: Path) -> None:
