@@ -23,7 +23,7 @@ import tempfile
 import time
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +33,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite.engine.api import (
     EngineOutcome,
     EntryStore,
+    Interruptible,
     Show,
     Work,
     WorkerJob,
@@ -180,26 +181,28 @@ class DaskEngine:
         self, cluster: Cluster, jobs: Sequence[WorkerJob], marks: Mapping[Path, str], workers: int, show: Show
     ) -> EngineOutcome:
         """Keep as many tasks out as there are workers, until all groups have finished or failed."""
-        outcome, waiting, running, begun = EngineOutcome(), deque(jobs), cluster.running, set[str]()
-        while waiting or running:
-            claims = held(job.work.store for job in jobs)
-            begun |= {job.name for job in running if job.claimed(claims)}
-            for _ in range(len(waiting)):
-                job = waiting.popleft()
-                # a worker whose Dask worker was lost may still be saving
-                if len(running) < workers and not (job.name in begun and job.claimed(claims)):
-                    cluster.submit(job, marks[job.work.store.path])
-                else:
-                    waiting.append(job)
-            time.sleep(LOOK_SECONDS)
-            for job, code in cluster.ended():
-                lost = code == 3 and job.name in begun  # the seeds are still those of the worker before
-                if code == 0 and not job.finished():
-                    job.said("it ended, but this machine does not see all of its results")
-                    code = 1
-                if lost or job.ended(code, outcome):
-                    waiting.append(job)
-            show({job.name: job.progress.read() for job in jobs})
+        outcome, waiting, running, begun = EngineOutcome(), deque(jobs), cluster.running, cluster.begun
+        with Interruptible() as guard:
+            while waiting or running:
+                claims = held(job.work.store for job in jobs)
+                begun |= {job for job in running if job.claimed(claims)}
+                with guard.deferred():  # a task that nobody has written down is not canceled
+                    for _ in range(len(waiting)):
+                        job = waiting.popleft()
+                        # a worker whose Dask worker was lost may still be saving
+                        if len(running) < workers and not (job in begun and job.claimed(claims)):
+                            cluster.submit(job, marks[job.work.store.path])
+                        else:
+                            waiting.append(job)
+                time.sleep(LOOK_SECONDS)
+                for job, code in cluster.ended():
+                    lost = code == 3 and job in begun  # the seeds are still those of the worker before
+                    if code == 0 and not job.finished():
+                        job.said("it ended, but this machine does not see all of its results")
+                        code = 1
+                    if lost or job.ended(code, outcome):
+                        waiting.append(job)
+                show({job.name: job.progress.read() for job in jobs})
         return outcome
 
 
@@ -209,6 +212,8 @@ class Cluster:
     def __init__(self, client: Any, address: str) -> None:
         self.client, self.address = client, address
         self.running: dict[WorkerJob, Any] = {}
+        self.begun: set[WorkerJob] = set()
+        """Whose seeds were claimed while a task of theirs was out."""
         self._begun, self._looked = time.monotonic(), False
 
     def submit(self, job: WorkerJob, mark: str) -> None:
@@ -271,14 +276,27 @@ class Cluster:
         return int(code), str(text)
 
     def stop(self) -> None:
-        """Cancel the tasks, and wait until their workers have saved and ended."""
+        """Cancel the tasks, and wait until their workers have saved and ended, and those of lost Dask workers, too."""
+        jobs, keys = self.begun.union(self.running), {task.key for task in self.running.values()}
         _quietly(self.client.cancel, [*self.running.values()])
         deadline = time.monotonic() + SAVE_SECONDS
         while time.monotonic() < deadline:
-            claims = held(job.work.store for job in self.running)
-            if not any(job.claimed(claims) for job in self.running):
-                return
+            # first the calls: a worker may start in one, and claim its seeds a moment later
+            if not self._called(keys):
+                claims = held(job.work.store for job in jobs)
+                if not any(job.claimed(claims) for job in jobs):
+                    return
             time.sleep(LOOK_SECONDS)
+
+    def _called(self, keys: Set[str]) -> bool:
+        """Return whether a call of these tasks may not have returned: it returns after its worker."""
+        if self.client.status != "running":
+            return False  # nobody can tell
+        try:
+            calls = self.client.sync(self.client.scheduler.call_stack, callback_timeout=FETCH_SECONDS)
+        except (Exception, asyncio.CancelledError):  # a Dask worker has just been lost
+            return True
+        return any(keys & set(its) for its in calls.values())
 
 
 def _mark(store: EntryStore, stack: contextlib.ExitStack) -> str:

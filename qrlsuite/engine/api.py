@@ -19,9 +19,10 @@ from qrlsuite.results.claims import Claim, certain
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.survey import submitted, write_submitted
+from qrlsuite.training.interrupts import Interruptible
 
 __all__ = [
-    "Claim", "Engine", "EngineOutcome", "EntryStore", "LocalEngine", "SeedGroup", "Show", "Snapshot", "Work",
-    "WorkerJob", "certain", "held", "raise_failures", "submitted", "usable_cores", "worker_command",
+    "Claim", "Engine", "EngineOutcome", "EntryStore", "Interruptible", "LocalEngine", "SeedGroup", "Show", "Snapshot",
+    "Work", "WorkerJob", "certain", "held", "raise_failures", "submitted", "usable_cores", "worker_command",
     "worker_environment", "write_submitted",
 ]  # fmt: skip

@@ -33,6 +33,7 @@ from qrlsuite.results.progress import Progress, ProgressFile, most_memory
 from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import counted
+from qrlsuite.training.interrupts import Interruptible
 
 if TYPE_CHECKING:
     from qrlsuite.training.group import Part
@@ -100,63 +101,68 @@ def train_group(
 
     state = Progress(epochs=epochs)
     taken: SeedsClaimedError | None = None
-    try:
-        parts: dict[int, list[Part]] = {}
-        for store in map(EntryStore, (folder, *others)):
-            try:
-                claims.append(acquire(store, seeds))
-            except SeedsClaimedError as error:
-                taken = error
-                continue
-            file = files[store.path] = ProgressFile(store, group_id(seeds))
-            if started is not None:
-                places[store.path] = slice(None)
-                script.train(started, store, seeds, file.path.with_name("output.txt"), state, report)
-                continue
-            probes.require_independent(store)
-            for group in plan_groups(store, seeds, epochs, workers=1):
-                parts.setdefault(group.epoch, []).append((store.entry(), store, group.seeds))
-        most = len(seeds) * max(1, len(files))
-        state.size, state.untried = min((file.size(most) for file in files.values()), default=most), True
-        report(state, force=True)
-        pieces = [piece for _, whole in sorted(parts.items()) for piece in divided(whole, state.size)]
-        for turn, together in enumerate(pieces):
-            probe = probing.prepare(together, epochs, device)
-            if probe is not None:
-                claims.append(probe.claim)
-            from qrlsuite.training.group import GroupRun  # torch, which scripts and a supervisor do without
+    with Interruptible() as guard:  # a claim is given back at any time
+        try:
+            parts: dict[int, list[Part]] = {}
+            for store in map(EntryStore, (folder, *others)):
+                try:
+                    with guard.deferred():
+                        claims.append(acquire(store, seeds))
+                except SeedsClaimedError as error:
+                    taken = error
+                    continue
+                file = files[store.path] = ProgressFile(store, group_id(seeds))
+                if started is not None:
+                    places[store.path] = slice(None)
+                    script.train(started, store, seeds, file.path.with_name("output.txt"), state, report)
+                    continue
+                probes.require_independent(store)
+                for group in plan_groups(store, seeds, epochs, workers=1):
+                    parts.setdefault(group.epoch, []).append((store.entry(), store, group.seeds))
+            most = len(seeds) * max(1, len(files))
+            state.size, state.untried = min((file.size(most) for file in files.values()), default=most), True
+            report(state, force=True)
+            pieces = [piece for _, whole in sorted(parts.items()) for piece in divided(whole, state.size)]
+            for turn, together in enumerate(pieces):
+                with guard.deferred():
+                    probe = probing.prepare(together, epochs, device)
+                    if probe is not None:
+                        claims.append(probe.claim)
+                # torch, which scripts and a supervisor do without
+                from qrlsuite.training.group import GroupRun
 
-            run = GroupRun(together, epochs, device, report, held, probe)
-            run.progress.size, run.progress.untried = state.size, state.untried
-            run.progress.turn, run.progress.turns = turn, len(pieces)
-            if state.size < most:
-                run.progress.warnings.append(
-                    f"{counted(state.size, 'seed')} at a time instead of {most}: with more, the process was "
-                    "killed before an epoch ended, as happens where memory is used up; for other entries "
-                    f"of this size, begin with --seeds {format_seeds(seeds[: state.size])}"
-                )
-            places |= {part.store.path: its for part, its in run.parts()}
-            state = run.progress
-            run.run()
-            report(state, force=True)  # that so many seeds fit, before more begin
-            del run
-        state.phase, state.epoch, state.untried = "finished", epochs, False
-        report(state, force=True)
-    except KeyboardInterrupt:
-        state.untried = False
-        report(state, force=True)
-        raise
-    except QrlSuiteError as error:
-        state.untried = False
-        if isinstance(error, probes.DependentSeedsError):
-            _stop_others(claims)
-        with contextlib.suppress(StoreError):  # on a full disk the message goes to stderr alone
-            report(state, str(error), force=True)
-        raise
-    finally:
-        heartbeat.stopped.set()
-        for claim in claims:
-            claim.release()
+                run = GroupRun(together, epochs, device, report, held, probe)
+                run.progress.size, run.progress.untried = state.size, state.untried
+                run.progress.turn, run.progress.turns = turn, len(pieces)
+                if state.size < most:
+                    run.progress.warnings.append(
+                        f"{counted(state.size, 'seed')} at a time instead of {most}: with more, the process was "
+                        "killed before an epoch ended, as happens where memory is used up; for other entries "
+                        f"of this size, begin with --seeds {format_seeds(seeds[: state.size])}"
+                    )
+                places |= {part.store.path: its for part, its in run.parts()}
+                state = run.progress
+                run.run()
+                report(state, force=True)  # that so many seeds fit, before more begin
+                del run
+            state.phase, state.epoch, state.untried = "finished", epochs, False
+            report(state, force=True)
+        except KeyboardInterrupt:
+            state.untried = False
+            report(state, force=True)
+            raise
+        except QrlSuiteError as error:
+            state.untried = False
+            if isinstance(error, probes.DependentSeedsError):
+                _stop_others(claims)
+            with contextlib.suppress(StoreError):  # on a full disk the message goes to stderr alone
+                report(state, str(error), force=True)
+            raise
+        finally:
+            heartbeat.stopped.set()
+            with guard.deferred():
+                for claim in claims:
+                    claim.release()
     if taken is not None:
         raise taken
 

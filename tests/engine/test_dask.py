@@ -140,6 +140,21 @@ def test_killed_again_and_again(kills: int, task: Path, cluster: Cluster, tmp_pa
     compare(undisturbed(task, tmp_path / "straight", SEEDS, epochs, SEEDS), entry, SEEDS, epochs)
 
 
+def test_ctrl_c_waits_for_workers_that_have_not_claimed_their_seeds(
+    task: Path, cluster: Cluster, tmp_path: Path
+) -> None:
+    for _ in range(SEEDS):
+        cluster.add()
+    run = start(*words(task, tmp_path / "runs", cluster.address, ENDLESS), env=environment())
+    dask_workers = [psutil.Process(worker.pid) for worker in cluster.workers]
+    while not any(dask_worker.children() for dask_worker in dask_workers):
+        assert run.poll() is None, run.communicate()[1]
+        time.sleep(0.002)
+    run.send_signal(signal.SIGINT)
+    assert run.wait() == 130
+    assert not [dask_worker.children() for dask_worker in dask_workers if dask_worker.children()]
+
+
 def test_over_tls_from_python(
     task: Path, train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,3 +41,25 @@ def test_a_claim_that_was_given_back_is_not_lost(
     heartbeat.join(10)
     assert not heartbeat.is_alive()
     assert killed == ([] if released else [signal.SIGTERM])
+
+
+def test_a_worker_that_is_told_to_end_before_it_trains_gives_its_seeds_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, deaths = EntryStore(tmp_path), list[int]()
+
+    def told(*given: object, **more: object) -> list[object]:
+        """SIGTERM comes after the seeds were claimed."""
+        assert [claim.seeds for claim in claims.claims(store)] == [(0,)]
+        signal.raise_signal(signal.SIGTERM)
+        return []
+
+    monkeypatch.setattr(worker, "plan_groups", told)
+    before = signal.signal(signal.SIGTERM, lambda number, frame: deaths.append(number))  # in place of a death
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            worker.train_group(store.path, [0], 1)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert not deaths
+    assert claims.claims(store) == []
