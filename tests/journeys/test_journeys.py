@@ -60,7 +60,7 @@ CHANGING = (
 After 2000 epochs, the score depends on how the processor's vectors round.
 """
 PROGRESS = re.compile(
-    r"seeds \d+/\d+  epoch |about [\d.]+ ?\w+ left|qrlsuite: compiling |one round of |faster: fewer "
+    r"seeds \d+/\d+  epoch |(about )?[\d.]+ ?\w+ (or more )?left, by |qrlsuite: compiling |one round of |faster: fewer "
 )
 """A line that is printed as often as there is time for, once on a machine, or on a slow one."""
 
