@@ -69,7 +69,6 @@ def describe(
         For a study the result of `read_study`.
     """
     folder = Path(runs)
-    of_ansatz = bool(settings or out or format)
     among = [] if kind == PICTURE else [specs.kind(kind)] if kind else list(specs.KINDS.values())
     if specs.StudySpec in among and is_study(name):
         among = [specs.StudySpec]
@@ -81,10 +80,16 @@ def describe(
     if specs.StudySpec in (*found[:1], *among[:1]) and len(found) < 2:
         from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
 
+        if settings or format or code:
+            raise OptionError(
+                f"study '{name}' takes no NAME=VALUE, --format or --identity here; --json prints it for scripts"
+            )
         return read_study(name, runs=folder, published=published)
     if kind in (None, PICTURE) and not found and name in compose.summaries():
+        _refuse(f"picture '{name}'", settings, out, format)
         return compose.describe(name)
     if not found and kind is None and (store := _stored(Selection(folder, published), name)):
+        _refuse(f"entry '{name}'", settings, out, format)
         return _code_of_entry(store) if code else _outline(store)
     if not found:
         names = [each for spec in among for each in registered.of(spec)] or list(compose.summaries())
@@ -96,17 +101,22 @@ def describe(
         raise UnknownNameError(f"'{name}' is several things; write {singulars}")
     if found == [specs.TaskSpec] and format == "toml" and not (settings or out):
         return {"format": format, "text": catalog.task_file(name)}
-    if of_ansatz and found != [specs.AnsatzSpec]:
-        raise OptionError(
-            f"{specs.title(found[0], name)}: NAME=VALUE, --out and --format draw an ansatz; options are changed where "
-            "they are used, as in `qrlsuite run --set NAME=VALUE`"
-        )
     if found == [specs.AnsatzSpec]:
         return _ansatz(name, settings or {}, code, out, format)
+    _refuse(specs.title(found[0], name), settings, out, format)
     if code:
         return _code_of_plugin(found[0], name)
     content = catalog.describe(found[0], name)
     return content | ({"promises": rules.load(name).promise} if found[0] is specs.RuleSpec else {})
+
+
+def _refuse(title: str, *of_ansatz: object) -> None:
+    """Raise where something else than an ansatz was asked for what only an ansatz has."""
+    if any(of_ansatz):
+        raise OptionError(
+            f"{title}: NAME=VALUE, --out and --format draw an ansatz; options are changed where they are used, as in "
+            "`qrlsuite run --set NAME=VALUE`"
+        )
 
 
 def is_study(name: str) -> bool:

@@ -288,6 +288,10 @@ show mpl => did you mean 'mlp'
 show mlp width=4 => model 'mlp': NAME=VALUE, --out and --format draw an ansatz
 show picture barz => nothing called 'barz'; did you mean 'bars'
 show ansatz iqp cx => ansatz iqp cx: give one name
+show advantage-pulse --format json => study 'advantage-pulse' takes no NAME=VALUE, --format or --identity here; --json
+show advantage-pulse advantage-cartpole --identity => several studies, without options, --format and --identity
+show advantage-pulse width=3 => study 'advantage-pulse' takes no NAME=VALUE
+show picture bars --format json => picture 'bars': NAME=VALUE, --out and --format draw an ansatz
 show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
 show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
 run mlp --task tiny => task 'tiny' is not registered, but in a file: write --task tiny.toml

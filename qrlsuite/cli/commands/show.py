@@ -72,9 +72,10 @@ def show(
         from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
 
         found: Any = read_study(*studies, runs=runs)
-    elif len(names) > 1:
+    elif len(names) > 1 or len(studies) > 1:
         raise typer.BadParameter(
-            f"{' '.join([name, *names])}: give one name, after a kind or alone; or several studies"
+            f"{' '.join([name, *names])}: give one name, after a kind or alone; or several studies, without "
+            "options, --format and --identity"
         )
     else:
         kind, target = (name, names[0]) if names else (None, name)
@@ -89,10 +90,11 @@ def show(
                 "--label: only entries of a study with looks take names of your own here"
             )
         found = found.labeled(label)
+    if not isinstance(found, dict) and out is not None:
+        write_atomically(out, text_of(found.sheets(), out).encode())
     if json_output:
         typer.echo(json.dumps(found if isinstance(found, dict) else found.as_dict()))
     elif not isinstance(found, dict) and out is not None:
-        write_atomically(out, text_of(found.sheets(), out).encode())
         typer.echo(f"wrote {out}")
     elif not isinstance(found, dict):
         table_console().print(found, soft_wrap=True)
