@@ -188,9 +188,10 @@ def draw(
     study = find(name)
     named = {section.name: section for section in study.pictures}
     if kind not in named and kind in OF_LOOKS and study.looks is not None:
-        if settings or seeds is not None or horizon is not None:
+        if settings or selection.tasks or seeds is not None or horizon is not None:
             raise OptionError(
-                f"picture '{kind}' of a study shows its looks as they are: leave the settings out"
+                f"picture '{kind}' of a study shows its looks as they are: leave settings, --task, --seeds and "
+                "--horizon out"
             )
         return _of_looks(kind, names, selection)
     if kind not in named and kind not in pictures.KINDS:
@@ -210,9 +211,12 @@ def draw(
     data = pictures.KINDS[section.kind].data
     if data == "deployed" and section.evaluation is None:
         raise OptionError(f"picture '{kind}' needs a study whose file has an evaluation, such as `deploy`")
-    if data == "deployed" and (seeds is not None or horizon is not None):
+    if data == "deployed" and (
+        seeds is not None or horizon is not None or selection.labels or selection.published
+    ):
         raise OptionError(
-            f"picture '{kind}' plays the best agents of all seeds: leave --seeds and --horizon out"
+            f"picture '{kind}' plays the best agents of all seeds here: leave --seeds, --horizon, --label and "
+            "--published out"
         )
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: {drawn_by(name, section, members, selection.runs)}")

@@ -67,6 +67,7 @@ def compose(
     """
     spec = find(kind, written.tasks)
     results = {"--entry": entries, "--horizon": horizon, "--seeds": seeds}
+    results |= {"--label": written.labels, "--published": written.published}
     if spec is not None and any(results.values()):
         name = next(name for name, value in results.items() if value)
         raise OptionError(f"picture '{kind}' shows no results: leave {name} out")

@@ -11,6 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
+from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
@@ -41,6 +42,8 @@ class SurfaceOptions:
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw S_hat of every cell, for every entry."""
     chosen: SurfaceOptions = options.build(SurfaceOptions, settings, "picture 'surface'")
+    if chosen.style == "map" and (unused := {"elevation", "azimuth"} & settings.keys()):
+        raise OptionError(f"picture 'surface': {min(unused)} is for style=3d")
     cells.one_task(entries, "surface")
     horizon = cells.choose_horizon(entries, chosen.horizon)
     grid = cells.choose_grid(entries[0], chosen.epsilons, chosen.deltas)

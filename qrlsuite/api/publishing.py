@@ -95,6 +95,10 @@ def export(
         raise OptionError(
             "export entries, studies and studies with looks with separate commands: they go to different folders"
         )
+    if with_looks and (tasks or force):
+        raise OptionError(
+            "a study with looks is written whole, and again while it goes on: leave --task and --force out"
+        )
     if with_looks:
         for study in with_looks:
             target = out or Path("leaderboard/plans")

@@ -68,6 +68,8 @@ def describe(
     dict or Overview or State or StudiesTogether
         For a study the result of `read_study`.
     """
+    if sum(map(bool, (code, out, format))) > 1:
+        raise OptionError("give one of --identity, --out and --format")
     folder = Path(runs)
     among = [] if kind == PICTURE else [specs.kind(kind)] if kind else list(specs.KINDS.values())
     if specs.StudySpec in among and is_study(name):
@@ -87,6 +89,8 @@ def describe(
         return read_study(name, runs=folder, published=published)
     if kind in (None, PICTURE) and not found and name in compose.summaries():
         _refuse(f"picture '{name}'", settings, out, format)
+        if code:
+            raise OptionError(f"picture '{name}' computes nothing for an entry, so it has no code identity")
         return compose.describe(name)
     if not found and kind is None and (store := _stored(Selection(folder, published), name)):
         _refuse(f"entry '{name}'", settings, out, format)

@@ -21,6 +21,7 @@ from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.notation import Written
 from qrlsuite.options import Setting, from_mapping
+from qrlsuite.results import codes
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.results.store import plugins_in
 from qrlsuite.results.survey import groups
@@ -187,6 +188,10 @@ def train_entry(
     if work.groups:
         missing.require_trainable([entry], where, quiet)
     display = RunDisplay(work, where.workers, quiet)
+    if where.same is not None and ((held := codes.of(work.store)) is None or len(held.digests) < 2):
+        display.console.print(
+            "--same changes nothing: there are no seeds of another code here", soft_wrap=True
+        )
     display.expected = None if quiet else missing.expected(work, where)
     with trackers.asking([track] if isinstance(track, str) else list(track)):
         submitted = missing.train(work, where, display, budget, confirmed).submitted

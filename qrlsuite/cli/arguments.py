@@ -10,6 +10,20 @@ from typing import Annotated, Any
 
 import typer
 
+from qrlsuite.errors import OptionError
+
+
+def is_typed(context: typer.Context, name: str) -> bool:
+    """Return whether a parameter was typed, and is not the default or a variable's value."""
+    return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
+
+
+def refuse_typed(context: typer.Context, where: str, *names: str) -> None:
+    """Refuse typed options, by their parameters, `where` they change nothing."""
+    for parameter in context.command.params:
+        if parameter.name in names and is_typed(context, parameter.name):
+            raise OptionError(f"{parameter.opts[0]} changes nothing {where}: leave it out")
+
 
 def names_of(kind: str) -> Callable[[str], list[str]]:
     """Return a function that completes a registered name; `kind` is as in `qrlsuite list`."""

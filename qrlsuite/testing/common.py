@@ -127,7 +127,10 @@ def subject(
         if entry is not None and entry.spec == spec:
             distribution = entry.distribution
     modules = () if distribution is None else plugin_modules(distribution)
-    return Subject(spec, distribution, modules, {**_small(spec), **(settings or {})})
+    made = Subject(spec, distribution, modules, {**_small(spec), **(settings or {})})
+    if settings and kind is not specs.AnsatzSpec and "options" not in made.references():
+        raise OptionError(f"{spec.title} has no options: leave {', '.join(settings)} out")
+    return made
 
 
 def _small(spec: specs.Spec) -> dict[str, int]:

@@ -292,6 +292,21 @@ show advantage-pulse --format json => study 'advantage-pulse' takes no NAME=VALU
 show advantage-pulse advantage-cartpole --identity => several studies, without options, --format and --identity
 show advantage-pulse width=3 => study 'advantage-pulse' takes no NAME=VALUE
 show picture bars --format json => picture 'bars': NAME=VALUE, --out and --format draw an ansatz
+show picture bars --identity => picture 'bars' computes nothing for an entry
+show ansatz iqp --format qasm3 --out iqp.png => give one of --identity, --out and --format
+runs --format csv --json => --format csv and --json: give one of them
+diagnose ansatz iqp qubits=2 --task beam6g => --task changes nothing for an ansatz: leave it out
+diagnose 'mlp width=64' --task beam6g --published --draws 50 => --draws changes nothing for entries
+check --task beam6g => --task needs a name
+leaderboard --task pulse --published --rule paper --alpha .2 => --alpha changes nothing in tiers by rule 'paper'
+leaderboard --task pulse --published --format csv --explain => --explain changes nothing in csv
+export advantage-pulse --force => a study with looks is written whole
+power --like many.csv --published => --published changes nothing with --like
+plot pairs --study advantage-pulse --task pulse => shows its looks as they are: leave settings, --task
+plot trajectories --task beam6g --label 'mlp=x' => picture 'trajectories' shows no results: leave --label out
+plot surface --task pulse --published elevation=50 => picture 'surface': elevation is for style=3d
+study run fig6 --dry-run --budget soon => --budget soon: write 90s, 30min
+tune mlp --task beam6g --vary lr=.01,.02 --engine slurm --budget 1h => --budget: engine 'slurm' leaves its tasks
 show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
 show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
 run mlp --task tiny => task 'tiny' is not registered, but in a file: write --task tiny.toml
@@ -348,7 +363,7 @@ plot bars --study fig6 --entry mlp => --study fig6 names the entries
 plot bars --study fig6 --study fig7 => picture 'bars' shows one study: leave fig7 out
 plot histogram --study fig8 => drawn by: qrlsuite evaluate 'ddqn mlp width=64' 'ddqn vqc-native qubits=14' --task beam6g
 plot deployed --study fig6 => needs a study whose file has an evaluation
-plot shots --study deploy --seeds 3 => plays the best agents of all seeds: leave --seeds
+plot shots --study deploy --seeds 3 => plays the best agents of all seeds here: leave --seeds
 plot bars --study fig6 --task cartpole --runs . => study 'fig6' has no entry of task cartpole
 plot entries --study memory --study quantum-or-not => picture 'entries' shows one study
 study end fig6 => study 'fig6' has no looks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -62,7 +63,7 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks(t
         say("show", study, "--out", str(tmp_path / "one.tex"))
         assert f"\\caption{{{caption}" in (tmp_path / "one.tex").read_text()
         assert f"\\label{{tab:{study}}}" in (tmp_path / "one.tex").read_text()
-    say("show", "ten-qubits", "--out", str(tmp_path / "one.tex"))
+    assert json.loads(say("show", "ten-qubits", "--out", str(tmp_path / "one.tex"), "--json").stdout)
     labels = re.findall(r"\\label{tab:(.*)}", (tmp_path / "one.tex").read_text())
     assert labels == ["ten-qubits-1", "ten-qubits-2", "ten-qubits-3"], "a table for each question"
     assert say("show", "equal-size-pulse").stdout.count("Does a circuit need fewer steps than") == 1

@@ -185,9 +185,13 @@ def trained(line: Path, tmp_path: Path) -> Author:
 
 
 def test_its_author_may_say_that_nothing_changed(trained: Author) -> None:
+    unchanged = trained.run("--same", "nothing was edited", model="line")
+    assert "--same changes nothing: there are no seeds of another code here" in unchanged.stderr
     trained.edit("own_helper", "filled(layer, generator):", "filled(layer, generator, more=None):")
     assert trained.run("--same", " ", model="line").returncode == 2
-    assert trained.run("--same", "an argument that nobody gives", model="line", seeds="4").returncode == 0
+    joined = trained.run("--same", "an argument that nobody gives", model="line", seeds="4")
+    assert joined.returncode == 0
+    assert "changes nothing" not in joined.stderr
     assert list(trained.board().values()) == [4]
     (name,) = trained.entries()
     (said,) = read_json(trained.runs / "tiny" / name / "entry.json")["same"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import zipfile
 from collections.abc import Callable, Sequence
@@ -585,7 +586,7 @@ def test_names_of_one_s_own_are_shown_as_they_are(
     assert qrlsuite("compare", "fast", "slow", *own).stdout.startswith("Ours, lr=0.1 needs")
     table = qrlsuite("leaderboard", *own, "--format", "csv").stdout
     assert [name in table for name in ("Ours, lr=0.1", "external baseline", "slow lr")] == [True, True, False]
-    qrlsuite("compare", "fast", "slow", *own, "--out", "verdict.tex")
+    assert json.loads(qrlsuite("compare", "fast", "slow", *own, "--out", "verdict.tex", "--json").stdout)
     verdict = (tmp_path / "verdict.tex").read_text()
     assert r"\caption{Ours, lr=0.1 needs 53\% fewer steps than external baseline (" in verdict
     qrlsuite("leaderboard", *own, "--out", "board.tex")

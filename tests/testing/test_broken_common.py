@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from qrlsuite import registry
+from qrlsuite.errors import OptionError
 from qrlsuite.specs import EngineSpec, EnvironmentSpec, ModelSpec, PictureSpec, Spec
 from qrlsuite.testing import common
 from qrlsuite.testing.common import check_common, subject
@@ -188,6 +189,11 @@ def test_what_nothing_registered_is_not_said_to_import_nothing() -> None:
     assert usable
     assert all(finding.ok for finding in findings), findings
     assert "lazy imports" not in {finding.rule for finding in findings}
+
+
+def test_options_of_what_has_none_are_refused() -> None:
+    with pytest.raises(OptionError, match="engine 'local' has no options: leave seats out"):
+        subject(EngineSpec, "local", {"seats": 2})
 
 
 @pytest.mark.parametrize("name", ["NoDataclass", "Required"])

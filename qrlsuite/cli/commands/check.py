@@ -49,6 +49,8 @@ def check(
     Examples: qrlsuite check my-model; qrlsuite check ansatz:ring depth=2; qrlsuite check my-distribution
     """
     if name is None:
+        if task:
+            raise typer.BadParameter("--task needs a name: qrlsuite check KIND:NAME --task TASK")
         _teach(json_output)
         return
     items = selection.select(name)

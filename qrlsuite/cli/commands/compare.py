@@ -67,11 +67,12 @@ def compare(
     comparison = api.compare(
         first, second, task=task, runs=runs, published=published, rule=rule, by=by, labels=label or ()
     )
+    if out is not None:
+        write_atomically(out, text_of(comparison.sheets(), out).encode())
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))
         return
     if out is not None:
-        write_atomically(out, text_of(comparison.sheets(), out).encode())
         typer.echo(f"wrote {out}")
         return
     Console().print(comparison)

@@ -9,7 +9,14 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api import diagnosis
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, names_of, split_settings
+from qrlsuite.cli.arguments import (
+    JsonOption,
+    PublishedOption,
+    RunsOption,
+    names_of,
+    refuse_typed,
+    split_settings,
+)
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import pictures
@@ -17,6 +24,7 @@ from qrlsuite.results.store import write_atomically
 
 
 def diagnose(
+    context: typer.Context,
     words: Annotated[
         list[str],
         typer.Argument(
@@ -67,6 +75,7 @@ def diagnose(
     quiet = not json_output
     found: diagnosis.CircuitDiagnosis | diagnosis.AgentsDiagnosis
     if words[0] == "ansatz":
+        refuse_typed(context, "for an ansatz", "task", "best", "episodes", "published", "runs")
         names, settings = split_settings(words[1:])
         sizes = [str(settings.pop(name, usual)) for name, usual in (("qubits", "2:8"), ("layers", "4"))]
         if len(names) != 1:
@@ -75,6 +84,7 @@ def diagnose(
             names[0], *sizes, draws=draws, seed=seed, options=settings, progress=quiet
         )
     else:
+        refuse_typed(context, "for entries", "draws")
         found = diagnosis.diagnose(
             *words,
             task=task,

@@ -20,12 +20,14 @@ from qrlsuite.cli.arguments import (
     RunsOption,
     TasksOption,
     names_of,
+    refuse_typed,
 )
 from qrlsuite.engine.sheet import WIDE, csv_rows
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard.boards.board import AXES, Leaderboard
 from qrlsuite.leaderboard.boards.times import ALPHA
+from qrlsuite.leaderboard.rules import STEPS
 from qrlsuite.leaderboard.shelf.collect import Selection
 from qrlsuite.results.store import write_atomically
 
@@ -41,6 +43,7 @@ ENDINGS: dict[str, Format] = {
 
 
 def leaderboard(
+    context: typer.Context,
     task: TasksOption = None,
     entry: EntryOption = None,
     label: LabelOption = None,
@@ -125,7 +128,10 @@ def leaderboard(
             raise OptionError(f"--format {format_} and --out {output}, which is {ending}: give one of them")
         format_ = ending
     tasks = list(task or ())
-
+    if format_ in ("html", "csv", "json"):
+        refuse_typed(context, f"in {format_}", "explain")
+    elif rule not in (None, STEPS):
+        refuse_typed(context, f"in tiers by rule '{rule}', which has an error of its own", "alpha")
     asked: dict[str, Any] = {
         "by": by,
         "study": study,

@@ -10,13 +10,21 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite import api
-from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption, entries_here
+from qrlsuite.cli.arguments import (
+    AmongOption,
+    JsonOption,
+    PublishedOption,
+    RunsOption,
+    entries_here,
+    refuse_typed,
+)
 from qrlsuite.cli.commands.import_ import divide
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError
 
 
 def power(
+    context: typer.Context,
     words: Annotated[
         list[str] | None,
         typer.Argument(
@@ -51,6 +59,7 @@ def power(
     Examples: qrlsuite power "mlp width=64" --task beam6g --published; qrlsuite power --like results.csv maximum=500
     """
     if like:
+        refuse_typed(context, "with --like", "published", "runs")
         names, options = divide(words or ())
         with tempfile.TemporaryDirectory() as folder:
             done = api.import_curves(like, task=task, runs=folder, **options)

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from qrlsuite.api.tables import progress_table
-from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption, entries_here
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption, entries_here, is_typed
 from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.status import EntryStatus, choose, delete_each, survey
 from qrlsuite.engine.terminal import command, printable, table_console
@@ -50,11 +50,13 @@ def runs(
     if context.invoked_subcommand is not None:
         action = context.invoked_subcommand
         for name in context.params:
-            if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
+            if is_typed(context, name):
                 raise OptionError(
                     f"put options after the action: qrlsuite runs {action} --task TASK --runs DIR"
                 )
         return
+    if format_ == "csv" and json_output:
+        raise OptionError("--format csv and --json: give one of them")
     statuses = survey(runs, task, [] if format_ == "csv" else looks.folders(runs))
     if format_ == "csv":
         typer.echo(csv_rows(progress_table(runs, statuses)), nl=False)

@@ -28,6 +28,7 @@ from qrlsuite.cli.training import (
     SameOption,
     WorkersOption,
 )
+from qrlsuite.engine.missing import check_budget
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
@@ -156,6 +157,7 @@ def run(
         outcome = take_looks(study, where, budget, runs, not json_output)
         _report(name, outcome, budget, runs, json_output)
         return
+    check_budget(budget, where)
     chosen, left_out = find_studies(name, *_changes(words), seeds, epochs, where, runs)
     for line in left_out:
         typer.echo(f"left out: {line}", err=True)

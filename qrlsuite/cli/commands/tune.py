@@ -18,6 +18,8 @@ from qrlsuite.cli.training import (
     SameOption,
     WorkersOption,
 )
+from qrlsuite.engine.budget import Budget
+from qrlsuite.engine.missing import check_budget
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import identity
@@ -125,6 +127,8 @@ def tune(
     """
     where = where_of(engine, workers, device, same)
     requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective.value, budget)
+    if budget is not None and Budget.parse(budget).time is not None:
+        check_budget(budget, where)
     path = preset_path(out, requests)
     searches = tuning_runner.build(requests, runs)
     display = TuneDisplay(searches, where, json_output)
