@@ -262,6 +262,8 @@ def find_studies(
     for study in map(studies.find, registry.load().names(specs.StudySpec) if name == ALL else [name]):
         try:
             members = study_runner.select(study, changes, models, only)
+            for word in only if name != ALL else ():
+                study_runner.select(study, changes, models, [word])
         except OptionError as error:
             refusals.append(error)
         else:

@@ -305,6 +305,7 @@ power --like many.csv --published => --published changes nothing with --like
 plot pairs --study advantage-pulse --task pulse => shows its looks as they are: leave settings, --task
 plot trajectories --task beam6g --label 'mlp=x' => picture 'trajectories' shows no results: leave --label out
 plot surface --task pulse --published elevation=50 => picture 'surface': elevation is for style=3d
+study run fig6 mlp boats --dry-run => boats: study 'fig6' has no such entry
 study run fig6 --dry-run --budget soon => --budget soon: write 90s, 30min
 tune mlp --task beam6g --vary lr=.01,.02 --engine slurm --budget 1h => --budget: engine 'slurm' leaves its tasks
 show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
