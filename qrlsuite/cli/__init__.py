@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import gc
 import io
 import itertools
@@ -20,13 +19,14 @@ from qrlsuite.cli.app import build, split_plugins
 from qrlsuite.engine.terminal import printable, printable_lines
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.registry import STRICT, PluginWarning
+from qrlsuite.training.interrupts import end_children_by_sigterm
 
 
 def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: save, and say so
-        os.register_at_fork(after_in_child=_end_by_sigterm)  # a pool of a plugin's ends its processes so
+        end_children_by_sigterm()
     # imports make a million objects that stay: to look for garbage among them takes a third of a short command's time
     gc.set_threshold(20_000, 20, 20)
     atexit.register(gc.freeze)
@@ -71,11 +71,6 @@ def main() -> None:
         except BrokenPipeError:
             sys.stderr.close()  # the reader (head, less) has gone
             sys.exit(0)
-
-
-def _end_by_sigterm() -> None:
-    with contextlib.suppress(ValueError):  # forked by another thread: its handlers cannot be changed
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _load_plugins(paths: list[str]) -> None:

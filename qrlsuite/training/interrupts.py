@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -26,6 +28,7 @@ class Interruptible:
 
     def __enter__(self) -> Interruptible:
         if threading.current_thread() is threading.main_thread():
+            end_children_by_sigterm()
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._old[number] = signal.signal(number, self._handle)
         return self
@@ -52,3 +55,17 @@ class Interruptible:
         if self._pending and not self._deferring:
             self._pending = False
             raise KeyboardInterrupt
+
+
+@functools.cache
+def end_children_by_sigterm() -> None:
+    """Let forked children, such as those of a plugin's pool, end by SIGTERM as any process does, from now on."""
+    os.register_at_fork(after_in_child=_end_by_sigterm)
+
+
+def _end_by_sigterm() -> None:
+    handler = signal.getsignal(signal.SIGTERM)
+    ours = isinstance(getattr(handler, "__self__", None), Interruptible)
+    if ours or handler is signal.default_int_handler:
+        with contextlib.suppress(ValueError):  # forked by another thread: its handlers cannot be changed
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import signal
 import time
+import warnings
 
 import pytest
 
@@ -77,6 +79,18 @@ def test_sigterm_saves_and_exits_130(train: Train) -> None:
     assert process.wait(HANGS) == 130
     assert checkpoint.headers(EntryStore(entry))[0].epoch >= 3
     assert not list((entry / "claims").glob("*.json"))
+
+
+def test_children_that_are_forked_meanwhile_end_by_sigterm() -> None:
+    with Interruptible() as guard, guard.deferred(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python 3.12 warns of threads
+        begun, say = multiprocessing.Pipe()
+        child = multiprocessing.get_context("fork").Process(target=lambda: (say.send(1), time.sleep(60)))
+        child.start()
+        begun.recv()
+    child.terminate()
+    child.join()
+    assert child.exitcode == -signal.SIGTERM
 
 
 def test_an_interruption_that_other_code_swallows_is_raised_at_the_end_of_the_next_deferred_block() -> None:
