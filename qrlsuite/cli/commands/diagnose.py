@@ -75,7 +75,7 @@ def diagnose(
     quiet = not json_output
     found: diagnosis.CircuitDiagnosis | diagnosis.AgentsDiagnosis
     if words[0] == "ansatz":
-        refuse_typed(context, "for an ansatz", "task", "best", "episodes", "published", "runs")
+        refuse_typed(context, "for an ansatz", "task", "best", "episodes", "published")
         names, settings = split_settings(words[1:])
         sizes = [str(settings.pop(name, usual)) for name, usual in (("qubits", "2:8"), ("layers", "4"))]
         if len(names) != 1:
