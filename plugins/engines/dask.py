@@ -202,6 +202,8 @@ class DaskEngine:
                         code = 1
                     if lost or job.ended(code, outcome):
                         waiting.append(job)
+                    else:
+                        begun.discard(job)  # whoever claims its seeds from now on is somebody else
                 show({job.name: job.progress.read() for job in jobs})
         return outcome
 
@@ -213,7 +215,7 @@ class Cluster:
         self.client, self.address = client, address
         self.running: dict[WorkerJob, Any] = {}
         self.begun: set[WorkerJob] = set()
-        """Whose seeds were claimed while a task of theirs was out."""
+        """Groups that have not ended, and whose seeds were claimed while a task of theirs was out."""
         self._begun, self._looked = time.monotonic(), False
 
     def submit(self, job: WorkerJob, mark: str) -> None:

@@ -261,9 +261,7 @@ def find_studies(
     found, refusals = list[Overview](), list[OptionError]()
     for study in map(studies.find, registry.load().names(specs.StudySpec) if name == ALL else [name]):
         try:
-            members = study_runner.select(study, changes, models, only)
-            for word in only if name != ALL else ():
-                study_runner.select(study, changes, models, [word])
+            members = study_runner.select(study, changes, models, only, each=name != ALL)
         except OptionError as error:
             refusals.append(error)
         else:

@@ -275,7 +275,9 @@ def tune(
     """
     where, folder = where_of(engine, workers, device, same), Path(runs)
     check_positive("epochs", epochs)
-    requests = read_requests(task, several(entries), vary or (), sampler, seeds, epochs, objective, budget)
+    requests = read_requests(
+        task, several(entries), vary or (), sampler, seeds, epochs, objective, budget, where
+    )
     path = preset_path(out, requests)
     searches = tuning_runner.build(requests, folder)
     display = TuneDisplay(searches, where, not progress)

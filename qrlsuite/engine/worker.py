@@ -159,8 +159,8 @@ def train_group(
                 report(state, str(error), force=True)
             raise
         finally:
-            heartbeat.stopped.set()
             with guard.deferred():
+                heartbeat.stopped.set()
                 for claim in claims:
                     claim.release()
     if taken is not None:

@@ -198,6 +198,7 @@ def select(
     settings: Sequence[Setting] = (),
     models: Mapping[str, str] | None = None,
     only: Sequence[str] = (),
+    each: bool = True,
 ) -> list[Member]:
     """Return the entries of a study that are wanted.
 
@@ -207,16 +208,18 @@ def select(
         As for `Study.members`; every model that takes the place of another has to be registered.
     only:
         Words that occur in an entry's group, label or task; or names of entries. Empty takes all.
+    each:
+        Whether every word has to fit an entry, and not one of them.
     """
     for new in (models or {}).values():
         registry.get(specs.ModelSpec, new)
     members = study.members(settings, models)
     if not only:
         return members
-    kept = [member for member in members if any(_mentions(member, word) for word in only)]
-    if not kept:
-        raise OptionError(f"{' or '.join(only)}: study '{study.name}' has no such entry")
-    return kept
+    unknown = [word for word in only if not any(_mentions(member, word) for member in members)]
+    if unknown and (each or len(unknown) == len(only)):
+        raise OptionError(f"{' or '.join(unknown)}: study '{study.name}' has no such entry")
+    return [member for member in members if any(_mentions(member, word) for word in only)]
 
 
 def _mentions(member: Member, word: str) -> bool:

@@ -19,8 +19,10 @@ from rich.console import Console, ConsoleOptions, RenderResult
 
 from qrlsuite import notation, options, registry
 from qrlsuite.engine.budget import Budget
+from qrlsuite.engine.missing import check_budget
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
@@ -121,6 +123,7 @@ def read_requests(
     epochs: int | None,
     objective: Objective,
     budget: str | None,
+    where: Where,
 ) -> list[Request]:
     """Return a request for each entry, all of them with the same budget.
 
@@ -143,6 +146,9 @@ def read_requests(
     if name != "bayesian" and for_bayesian:
         what = for_bayesian[0]
         raise OptionError(f"{what} is for --sampler bayesian, and not for {name}")
+    limit = None if budget is None else Budget.parse(budget)
+    if limit is not None and limit.time is not None:
+        check_budget(budget, where)
     shared = Request(
         task,
         "",
@@ -151,7 +157,7 @@ def read_requests(
         sampler=name,
         trials=chosen.trials,
         sampler_seed=chosen.seed,
-        budget=None if budget is None else Budget.parse(budget),
+        budget=limit,
         regret=samplers.REGRET if chosen.regret is None else chosen.regret,
         last=samplers.LAST * len(own) if chosen.last is None else chosen.last,
         rows=rows,

@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.engine.budget import Budget
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf.curves import _tuned_text
@@ -409,5 +410,7 @@ def test_one_value_beside_settings_is_settings_too(tiny_task: str) -> None:
         (["lr=.002,.004", "lr=.002 epsilon=.2"], "bayesian"),
         (["lr={low=1e-3,high=1e-2}"], "bayesian"),
     ):
-        [wanted] = search.read_requests(tiny_task, ["mlp"], vary, None, None, None, "time", None)
+        [wanted] = search.read_requests(
+            tiny_task, ["mlp"], vary, None, None, None, "time", None, Where.create("local")
+        )
         assert wanted.sampler == sampler

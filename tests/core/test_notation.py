@@ -70,12 +70,10 @@ def test_published_labels_make_the_published_entries() -> None:
 
     But the options of an ansatz, which were written as a table.
     """
-    files = [
+    files = [  # but the family's: its tasks are files, and have no name here
         file for place in ("entries", "unranked", "plans") for file in SHELF.glob(f"{place}/**/entry.json")
     ]
-    records = [
-        json.loads(file.read_text()) for file in files
-    ]  # the family's tasks are files, and have no name here
+    records = [json.loads(file.read_text()) for file in files]
     kept = {
         record["label"]: record for record in records if record["task_hash"] == task_hash(record["task_name"])
     }

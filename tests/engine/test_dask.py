@@ -152,7 +152,7 @@ def test_ctrl_c_waits_for_workers_that_have_not_claimed_their_seeds(
         time.sleep(0.002)
     run.send_signal(signal.SIGINT)
     assert run.wait() == 130
-    assert not [dask_worker.children() for dask_worker in dask_workers if dask_worker.children()]
+    assert not [child for dask_worker in dask_workers for child in dask_worker.children()]
 
 
 def test_over_tls_from_python(

@@ -18,8 +18,6 @@ from qrlsuite.cli.training import (
     SameOption,
     WorkersOption,
 )
-from qrlsuite.engine.budget import Budget
-from qrlsuite.engine.missing import check_budget
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import identity
@@ -126,9 +124,9 @@ def tune(
     Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
     where = where_of(engine, workers, device, same)
-    requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective.value, budget)
-    if budget is not None and Budget.parse(budget).time is not None:
-        check_budget(budget, where)
+    requests = read_requests(
+        task, entries, vary or (), sampler, seeds, epochs, objective.value, budget, where
+    )
     path = preset_path(out, requests)
     searches = tuning_runner.build(requests, runs)
     display = TuneDisplay(searches, where, json_output)
